@@ -1,0 +1,23 @@
+"""Multi-layer encoders: VGG activations of a picture, by layer name (paper Sec. 3.3.2).
+
+Importing this package is cheap: torch is loaded by the first ``load_encoder`` call.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from styleexp.encoders.specs import ENCODERS, EncoderSpec, load_encoder
+
+if TYPE_CHECKING:
+    from styleexp.encoders.vgg import Encoder
+
+__all__ = ["ENCODERS", "Encoder", "EncoderSpec", "load_encoder"]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "Encoder":
+        from styleexp.encoders.vgg import Encoder
+
+        return Encoder
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,145 @@
+"""``styleexp``: compose the configuration, run, and say in one sentence what went wrong if it did."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import sys
+from typing import NoReturn
+
+# Spinning OpenMP threads made a 28 ms render take 3 s on two busy cores. Read when torch loads.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+
+def main() -> None:
+    """Entry point of the ``styleexp`` command."""
+    from styleexp.errors import UserError
+
+    try:
+        resume = [a for a in sys.argv[1:] if a.startswith("resume=")]
+        if resume:
+            _resume(resume[0].removeprefix("resume="))
+        else:
+            _hydra()
+    except UserError as error:
+        _stop(str(error))
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def _hydra() -> None:
+    import hydra
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    from styleexp import compose
+
+    compose.register()
+    failures: list[int] = []
+
+    # Hydra prints and exits by itself unless told to raise; we want one sentence and exit code 2.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+
+    @hydra.main(version_base="1.3", config_path=compose.CONFIG_PATH, config_name="config")
+    def job(config):  # type: ignore[no-untyped-def]
+        from pathlib import Path
+
+        from hydra.core.hydra_config import HydraConfig
+
+        from styleexp.cli.run import run
+        from styleexp.errors import UserError
+
+        runtime = HydraConfig.get()
+        try:
+            code = run(
+                compose.typed(config),
+                Path(runtime.runtime.output_dir),
+                list(runtime.overrides.task),
+            )
+        except UserError as error:
+            if config.debug:
+                raise
+            print(f"styleexp: {error}", file=sys.stderr)
+            code = 2
+        if code:
+            failures.append(code)
+
+    try:
+        job()
+    except (HydraException, OmegaConfBaseException) as error:
+        if "debug=true" in sys.argv:
+            raise
+        _stop(explain(error))
+    except OSError as error:
+        if "debug=true" in sys.argv:
+            raise
+        _stop(f"cannot write the run's folder: {error}; choose another with hydra.run.dir=FOLDER.")
+    if failures:
+        sys.exit(max(failures))
+
+
+def explain(error: Exception) -> str:
+    """Hydra's complaint as one or two sentences, with the nearest known name."""
+    text = str(error)
+    missing = re.search(r"Could not find '([\w/]+)/([^'/]+)'", text)
+    if missing:
+        from styleexp import compose
+        from styleexp.errors import unknown_name
+
+        compose.register()
+        return str(unknown_name(missing[1], missing[2], _options(missing[1])))
+    key = re.search(r"Key '(\w+)' (?:is not in struct|not in '(\w+)')", text)
+    if key:
+        from styleexp.config import Config
+
+        known = sorted(_keys(Config))
+        near = difflib.get_close_matches(key[1], [k.split(".")[-1] for k in known], n=1)
+        full = [k for k in known if near and k.split(".")[-1] == near[0]]
+        hint = f"did you mean {' or '.join(full)}? " if full else ""
+        return f"there is no key '{key[1]}': {hint}'styleexp --help' lists the keys."
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    where = next((line for line in lines if line.startswith("full_key:")), "")
+    return " ".join([lines[0] if lines else type(error).__name__, where]).strip()
+
+
+def _options(group: str) -> list[str]:
+    from hydra._internal.config_loader_impl import ConfigLoaderImpl
+    from hydra._internal.utils import create_config_search_path
+
+    from styleexp import compose
+
+    loader = ConfigLoaderImpl(create_config_search_path(compose.CONFIG_PATH))
+    return loader.get_group_options(group)
+
+
+def _keys(schema: type, prefix: str = "") -> list[str]:
+    import dataclasses
+    import typing
+
+    found = []
+    for name, kind in typing.get_type_hints(schema).items():
+        found.append(prefix + name)
+        if dataclasses.is_dataclass(kind):
+            found += _keys(typing.cast(type, kind), f"{prefix}{name}.")
+    return found
+
+
+def _resume(folder: str) -> None:
+    from pathlib import Path
+
+    from styleexp.cli.run import resume
+    from styleexp.errors import UserError
+
+    others = [a for a in sys.argv[1:] if not a.startswith("resume=")]
+    if others:
+        raise UserError(
+            f"resume= goes on with the configuration of its folder and takes no other argument: "
+            f"drop {' '.join(others)}."
+        )
+    sys.exit(resume(Path(folder)))
+
+
+def _stop(message: str) -> NoReturn:
+    print(f"styleexp: {message}", file=sys.stderr)
+    sys.exit(2)

@@ -1,0 +1,89 @@
+"""Hydra's configuration of this package, for the command line and for Python callers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig, OmegaConf
+
+from styleexp import config as schema
+from styleexp.assets import names as asset_names
+from styleexp.encoders.specs import ENCODERS
+from styleexp.renderers.specs import RENDERERS
+from styleexp.shapes import SOURCES, STYLES
+
+CONFIG_PATH = "pkg://styleexp.conf"
+
+
+def register() -> None:
+    """Tell Hydra the schema, and one option for each registered name. Safe to call again."""
+    store = ConfigStore.instance()
+    store.store(name="base_config", node=schema.Config)
+    for spec in RENDERERS.values():
+        store.store(group="renderer", name=spec.name, node=spec.config)
+    for name in ENCODERS:
+        store.store(group="encoder", name=name, node={"name": name})
+    store.store(group="field", name="fourier_mlp", node={"name": "fourier_mlp"})
+    meshes, pictures = asset_names("mesh"), asset_names("image")
+    for name in {*SOURCES, *STYLES, *meshes}:
+        store.store(group="source", name=name, node={"name": name})
+    for name in {*SOURCES, *STYLES, *meshes, *pictures}:
+        store.store(group="style", name=name, node={"name": name})
+    store.store(
+        group="hydra/help",
+        name="styleexp",
+        node={"app_name": "styleexp", "header": HELP_HEADER, "template": HELP_TEMPLATE},
+    )
+    OmegaConf.register_new_resolver("run_name", _run_name, replace=True)
+
+
+def typed(config: DictConfig) -> schema.Config:
+    """The composed configuration as plain dataclasses."""
+    plain = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(plain, dict)
+    renderer = plain.pop("renderer")
+    built: Any = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema.Config), plain))
+    options = RENDERERS[renderer["name"]].config if renderer["name"] in RENDERERS else dict
+    built.renderer = options(**renderer)
+    return built
+
+
+def compose(overrides: Sequence[str]) -> schema.Config:
+    """The configuration that the command line makes of these overrides."""
+    import hydra
+
+    register()
+    with hydra.initialize_config_module("styleexp.conf", version_base="1.3"):
+        return typed(hydra.compose("config", overrides=list(overrides)))
+
+
+def _run_name(source: Any, style: Any) -> str:
+    from pathlib import PurePath
+
+    def short(part: Any) -> str:
+        return PurePath(part.path).stem if part.path else str(part.name)
+
+    return f"{short(source)}-{short(style)}"
+
+
+HELP_HEADER = """\
+${hydra.help.app_name}: put the local geometry of a mesh or picture onto another mesh.
+"""
+
+HELP_TEMPLATE = """\
+${hydra.help.header}
+  styleexp source=spot style=bubble
+  styleexp source.path=my.obj style.path=her.ply
+  styleexp source=critter style.path=peeling.jpg profile=fast
+  styleexp method=paper encoder=vgg19 field.sigma=5 source=critter style=stripe
+  styleexp resume=outputs/spot-bubble/2026-01-31_12-00-00
+
+Choices (group=option):
+$APP_CONFIG_GROUPS
+Keys, with their values for these choices (key=value, e.g. optim.steps=50):
+$CONFIG
+The run's folder: hydra.run.dir=FOLDER. Tracebacks: debug=true. Completion:
+eval "$(styleexp -sc install=bash)". Hydra's own flags: --hydra-help
+"""

@@ -1,0 +1,210 @@
+"""The configuration schema: every choice of an experiment, with its meaning.
+
+Hydra validates against these dataclasses. Defaults here are the ``robust`` method's; ``conf/method``
+holds the presets and ``conf/profile`` the sizes. Section and equation numbers are the paper's.
+This module imports nothing heavy: ``styleexp --help`` reads it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from dataclasses import field as option
+from typing import Any
+
+
+@dataclass
+class SourceConfig:
+    """The source mesh C, whose shape is kept."""
+
+    name: str | None = None
+    """A named asset or analytic shape (``styleexp-assets list``)."""
+    path: str | None = None
+    """A mesh file; wins over ``name``."""
+    remesh: int | None = None
+    """Remesh to about this many vertices first (attributes are lost); null keeps the mesh as it is."""
+
+
+@dataclass
+class StyleConfig:
+    """The style source S: a mesh or an image (Sec. 4.2)."""
+
+    name: str | None = None
+    """A named asset or analytic style."""
+    path: str | None = None
+    """A mesh or image file; wins over ``name``."""
+    scale: float = 1.0
+    """Size of the pattern on the result: 2 makes its features twice as large."""
+    image_contrast: float | None = 0.12
+    """Image styles: standard deviation that the picture's tone is brought to (it sets the height of
+    the relief); null keeps the picture's own contrast."""
+    image_match_mean: bool = True
+    """Image styles: shift the picture's mean tone to the mean of the rendered source."""
+    image_tile: float = 1.0
+    """Image styles: how many source radii the picture's longer side spans on the result."""
+
+
+@dataclass
+class FieldConfig:
+    """The displacement field: an MLP on Fourier features (Sec. 3.2, Eq. 1)."""
+
+    name: str = "fourier_mlp"
+    sigma: float = 5.0
+    """Standard deviation of the frequency matrix B (Fig. 7)."""
+    features: int = 128
+    """Rows of B; the encoding has twice as many entries (h_f = 256)."""
+    include_input: bool = False
+    """Also feed the raw coordinates, as Text2Mesh does."""
+    progressive: float = 0.0
+    """Open the frequency bands over this share of the run (Text2Mesh: 0.13); 0 is off."""
+    width: int = 256
+    depth: int = 8
+    """Fully connected layers, the output layer included."""
+    bound: float = 0.1
+    """Displacements lie in (-bound, bound), in radii of the normalised source."""
+    zero_mean: bool = True
+    """Subtract the area-weighted mean displacement, so that the mesh can't shrink as a whole."""
+
+
+@dataclass
+class LocalViewsConfig:
+    """Local views (Sec. 3.3.1, Eq. 2)."""
+
+    mode: str = "surface"
+    """``image``: crops of the rendered global view, as in the paper. ``zoom``: the same windows,
+    rendered anew by a zoomed camera. ``surface``: a zoomed camera aimed at a random surface point."""
+    per_view: int = 4
+    """Local views for each global view."""
+    crop: str = "side"
+    """``image`` and ``zoom``: whether the paper's 10 % are of the ``side`` or of the ``area``."""
+    share: float = 0.1
+    """That share."""
+    size: int = 112
+    """Pixels on a side; ``image`` crops are resized to it."""
+    extent: float = 0.5
+    """``surface``: width of the window at the surface, in radii of the normalised mesh."""
+
+
+@dataclass
+class ViewsConfig:
+    """Global views (Secs. 3.3.1 and 4.1)."""
+
+    count: int = 5
+    resolution: int = 250
+    fov: float = 60.0
+    """Field of view in degrees."""
+    distance: float = 2.0
+    elevation: float = 0.0
+    azimuth: float = 0.0
+    """Centre of the view distribution, in degrees; azimuth 0 looks from +Z, 90 from +X."""
+    elevation_std: float = 45.0
+    azimuth_std: float = 45.0
+    """Standard deviations in degrees (paper: pi/4)."""
+    spread: str = "around"
+    """``normal``: azimuth from the normal distribution, as in the paper. ``around``: azimuth spread
+    evenly around the object, so that its back is styled too."""
+    perspective: float = 0.5
+    """Distortion of the random perspective (omega_global); 0 is off."""
+    perspective_probability: float = 0.8
+    perspective_fill: float = 1.0
+    local: LocalViewsConfig = option(default_factory=LocalViewsConfig)
+
+
+@dataclass
+class ShadingConfig:
+    """How the training renders look (METHOD: Text2Mesh's light)."""
+
+    albedo: float = 0.5
+    normals: str = "smooth"
+    """``flat`` or ``smooth``."""
+    background: str = "foreground"
+    """``white``, ``black``, ``foreground`` (the mean grey of the rendered source) or a number."""
+    light: str = "fixed"
+    """``fixed`` in camera space, or ``random``: a direction of its own for every view, the same for
+    style and result."""
+
+
+@dataclass
+class EncoderConfig:
+    """The feature encoder F (Sec. 3.3.2)."""
+
+    name: str = "vgg16"
+    precision: str = "auto"
+    """``auto`` (bf16 where the hardware gains from it), ``fp32`` or ``bf16``; the one chosen is in
+    the run's record."""
+    pooling: str = "max"
+    normalisation: str = "weights"
+    """``weights``: what the weights were trained with; ``paper``: the constants of Sec. 4.1."""
+
+
+@dataclass
+class LossConfig:
+    """The style loss (Eqs. 3-8)."""
+
+    layers: list[Any] = option(
+        default_factory=lambda: ["conv1_1", "conv2_1", "conv3_1", "conv4_1", "conv5_1"]
+    )
+    """Style layers, by name or by the paper's 1-based index of VGG-19's convolutions."""
+    block_weights: list[float] = option(default_factory=lambda: [1.0, 1.0, 1.0, 0.2, 0.1])
+    """A weight for the layers of each of VGG's five blocks."""
+    lambda_global: float = 1.0
+    lambda_local: float = 1.0
+    """lambda of Eq. 7 (paper: 0.1)."""
+    masked: bool = True
+    """Grams over the foreground only, divided by its area, not over the whole frame."""
+    erosion: int = 2
+    """Cells taken off the mask's rim at every layer; they see the background."""
+    relative: bool = True
+    """Divide each layer's squared distance by the target's squared norm."""
+    target: str = "bank"
+    """``bank``: the style's Grams are averaged once over a bank of views. ``same_views``: the style
+    mesh is rendered at the result's views in every step, as in the paper."""
+    bank_views: int = 24
+    smoothness: float = 0.0
+    """Weight of the displacement's squared Laplacian."""
+
+
+@dataclass
+class OptimConfig:
+    """Adam with a stepped rate (Sec. 4.1)."""
+
+    steps: int = 150
+    rate: float = 1e-3
+    decay: float = 0.9
+    decay_every: int = 100
+    seed: int = 0
+    renormalize: bool = False
+    """Fit the displaced mesh into the unit sphere in every step, as Text2Mesh does."""
+    checkpoint_every: int = 25
+
+
+@dataclass
+class PreviewConfig:
+    """What is drawn of the result; never seen by the optimisation."""
+
+    resolution: int = 320
+    turntable_frames: int = 36
+
+
+@dataclass
+class Config:
+    """One run."""
+
+    source: SourceConfig = option(default_factory=SourceConfig)
+    style: StyleConfig = option(default_factory=StyleConfig)
+    renderer: Any = None
+    """The backend's own options, with its registered ``name``."""
+    encoder: EncoderConfig = option(default_factory=EncoderConfig)
+    field: FieldConfig = option(default_factory=FieldConfig)
+    views: ViewsConfig = option(default_factory=ViewsConfig)
+    shading: ShadingConfig = option(default_factory=ShadingConfig)
+    loss: LossConfig = option(default_factory=LossConfig)
+    optim: OptimConfig = option(default_factory=OptimConfig)
+    preview: PreviewConfig = option(default_factory=PreviewConfig)
+    strength: float = 1.0
+    """Factor on the final displacement; 0 gives the source back."""
+    device: str = "auto"
+    """``auto`` (cuda where there is one), ``cpu``, ``cuda`` or ``cuda:N``."""
+    threads: int = 0
+    """CPU threads for torch; 0 takes all cores."""
+    debug: bool = False
+    """Show tracebacks of user errors."""

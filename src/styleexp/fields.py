@@ -1,0 +1,90 @@
+"""The position-encoded displacement field (Sec. 3.2, Eq. 1)."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+from torch import nn
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch import Tensor
+
+    from styleexp.config import FieldConfig
+
+
+class FourierFeatures(nn.Module):
+    """Random Fourier features, gamma(v) = [cos 2 pi B v, sin 2 pi B v] (Eq. 1).
+
+    B is (features, 3) with entries from N(0, sigma^2), frozen. Its rows are sorted by norm, so that
+    opening the bands progressively goes from low to high frequencies.
+    """
+
+    frequencies: Tensor
+
+    def __init__(
+        self, features: int, sigma: float, include_input: bool, generator: torch.Generator
+    ):
+        super().__init__()
+        frequencies = torch.randn(features, 3, generator=generator) * sigma
+        order = frequencies.norm(dim=1).argsort()
+        self.register_buffer("frequencies", frequencies[order])
+        self.include_input = include_input
+        self.size = 2 * features + (3 if include_input else 0)
+
+    def forward(
+        self, points: Float[Tensor, "vertices 3"], opened: float = 1.0
+    ) -> Float[Tensor, "vertices size"]:
+        """Encode points; ``opened`` in [0, 1] is the share of bands that are let through."""
+        phase = 2 * math.pi * points @ self.frequencies.T
+        rows = self.frequencies.shape[0]
+        window = (opened * rows - torch.arange(rows, device=points.device)).clamp(0, 1)
+        bands = [phase.cos() * window, phase.sin() * window]
+        return torch.cat([points, *bands] if self.include_input else bands, dim=1)
+
+
+class DisplacementField(nn.Module):
+    """MLP from a position to its displacement along the normal, in (-bound, bound).
+
+    The last layer starts at zero, so that the generated mesh is the source mesh at step 0.
+    """
+
+    def __init__(self, config: FieldConfig, generator: torch.Generator):
+        super().__init__()
+        self.bound = config.bound
+        self.encode = FourierFeatures(
+            config.features, config.sigma, config.include_input, generator
+        )
+        sizes = [self.encode.size] + [config.width] * (config.depth - 1) + [1]
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes, sizes[1:], strict=False))
+        for layer in self.layers:  # torch's default initialisation, from our own generator
+            span = 1 / math.sqrt(layer.in_features)
+            nn.init.uniform_(layer.weight, -span, span, generator=generator)
+            nn.init.uniform_(layer.bias, -span, span, generator=generator)
+        nn.init.zeros_(self.layers[-1].weight)
+        nn.init.zeros_(self.layers[-1].bias)
+
+    def forward(
+        self, encoded: Float[Tensor, "vertices size"], precision: torch.dtype = torch.float32
+    ) -> Float[Tensor, " vertices"]:
+        """Displacement for each row of ``encode(points)``, in radii of the normalised source.
+
+        Hidden layers run in ``precision``; the last one always in float32, because neighbouring
+        displacements differ by less than bfloat16 resolves.
+        """
+        *hidden, last = self.layers
+        x = encoded.to(precision)
+        for layer in hidden:
+            x = torch.relu(
+                nn.functional.linear(x, layer.weight.to(precision), layer.bias.to(precision))
+            )
+        return self.bound * torch.tanh(last(x.float()).squeeze(-1))
+
+
+def zero_mean(
+    displacement: Float[Tensor, " vertices"], areas: Float[Tensor, " vertices"]
+) -> Float[Tensor, " vertices"]:
+    """Subtract the area-weighted mean, so that the mesh neither grows nor shrinks as a whole."""
+    return displacement - (displacement * areas).sum() / areas.sum()

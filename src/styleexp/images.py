@@ -1,0 +1,122 @@
+"""Pictures in: any common raster file as RGB floats, or one sentence on what is wrong with it."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from styleexp.errors import UserError
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from PIL import Image
+    from torch import Tensor
+
+    Array = TypeVar("Array", np.ndarray, Tensor)
+
+MIN_SIDE = 16
+"""Pixels: the deepest style layer has one cell per 16 pixels."""
+FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "GIF", "BMP", "PPM", "JPEG2000", "AVIF")
+"""Raster formats only: for EPS and the like Pillow would start other programs."""
+
+
+def load_image(path: str | Path, *, background: float = 1.0) -> Float[np.ndarray, "height width 3"]:
+    """Read a picture as float32 RGB in [0, 1], row 0 at the top.
+
+    PNG, JPEG, WebP, TIFF and others (:data:`FORMATS`): colour, grey, palette, CMYK, 16-bit grey
+    (scaled by 65535; 16-bit colour keeps its upper 8 bits), 32-bit float TIFF within [0, 1]. The
+    EXIF rotation is applied, an animation gives its first frame. Values are as stored
+    (sRGB-coded); colour profiles are not applied.
+
+    Args:
+        path: the file. Its name does not matter, its content does.
+        background: grey level in [0, 1] under transparent pixels; white, as the paper fills views.
+
+    Raises:
+        UserError: missing, empty, truncated, not a raster picture, under 16 pixels on a side, or
+            over Pillow's limit on pixels (``PIL.Image.MAX_IMAGE_PIXELS``).
+    """
+    path = Path(path)
+    if not path.is_file():
+        what = "is a folder, not an image" if path.is_dir() else "does not exist"
+        raise UserError(f"the image '{path}' {what}.")
+    try:
+        with path.open("rb") as file:
+            head = file.read(1024)
+    except OSError as error:
+        raise UserError(f"the image '{path}' cannot be read: {error.strerror}.") from error
+    if not head:
+        raise UserError(f"the image '{path}' is empty (0 bytes).")
+
+    from PIL import Image, ImageOps, UnidentifiedImageError
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            Image.init()
+            readable = [name for name in FORMATS if name in Image.OPEN]
+            with Image.open(path, formats=readable) as image:
+                if min(image.size) < MIN_SIDE:
+                    raise UserError(
+                        f"the image '{path}' is {image.width}x{image.height} pixels; "
+                        f"it needs at least {MIN_SIDE} on each side."
+                    )
+                pixels = _rgb(ImageOps.exif_transpose(image), path, background)
+    except UserError:
+        raise
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+        raise UserError(
+            f"the image '{path}' has more than {Image.MAX_IMAGE_PIXELS} pixels; "
+            "scale it down first, a few thousand on a side are plenty."
+        ) from error
+    except UnidentifiedImageError as error:
+        raise UserError(f"the image '{path}' {_guess(head)}") from error
+    # Pillow's decoders raise almost anything on damaged files (OSError, SyntaxError, ValueError,
+    # struct.error, EOFError, ...), and for the user they all mean the same.
+    except Exception as error:
+        reason = str(error).rstrip(".") or type(error).__name__
+        raise UserError(
+            f"the image '{path}' is damaged or cut short and cannot be decoded ({reason})."
+        ) from error
+    return pixels
+
+
+def luminance(rgb: Array) -> Array:
+    """Grey levels of an image, (..., 3) -> (...): 0.299 R + 0.587 G + 0.114 B (ITU-R BT.601).
+
+    The weights are for sRGB-coded values, as :func:`load_image` returns; they sum to 1, so grey
+    stays what it is. Takes NumPy arrays and torch tensors.
+    """
+    return 0.299 * rgb[..., 0] + 0.587 * rgb[..., 1] + 0.114 * rgb[..., 2]
+
+
+def _rgb(image: Image.Image, path: Path, background: float) -> np.ndarray:
+    if image.mode.startswith("I") or image.mode == "F":
+        grey = np.asarray(image, dtype=np.float32)
+        top = 1.0 if image.mode == "F" else 65535.0
+        if not np.isfinite(grey).all() or grey.min() < 0 or grey.max() > top:
+            raise UserError(
+                f"the image '{path}' has 32-bit values outside [0, {top:g}]; "
+                "save it with 8 or 16 bits per channel."
+            )
+        return np.repeat((grey / np.float32(top))[..., None], 3, axis=-1)
+    if image.has_transparency_data:
+        rgba = np.asarray(image.convert("RGBA"), dtype=np.float32) / np.float32(255)
+        alpha = rgba[..., 3:]
+        return rgba[..., :3] * alpha + np.float32(background) * (1 - alpha)
+    return np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255)
+
+
+def _guess(head: bytes) -> str:
+    """Why Pillow does not know the file, as far as its first bytes tell."""
+    text = head.lstrip(b"\xef\xbb\xbf \t\r\n").lower()
+    if text.startswith(b"<svg") or (text.startswith(b"<?xml") and b"<svg" in text):
+        return "is an SVG drawing; export it as PNG first."
+    if text.startswith((b"<!doctype html", b"<html")):
+        return "is a web page, not an image: the download probably went wrong."
+    if b"\0" not in head and not head.strip(bytes(range(32, 127)) + b"\t\r\n"):
+        return "is a text file, not an image."
+    return "is not an image that can be read; use PNG, JPEG, WebP or TIFF."

@@ -1,0 +1,96 @@
+"""Gram matrices and the style loss (Sec. 3.3.2 and 3.3.3, Eqs. 3-8)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch.nn import functional
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jaxtyping import Bool, Float
+    from torch import Tensor
+
+    from styleexp.config import LossConfig
+    from styleexp.encoders import Encoder
+
+Grams = list["Float[Tensor, 'channels channels']"]
+"""One Gram matrix per style layer, averaged over views."""
+
+
+def gram_matrix(
+    features: Float[Tensor, "views channels height width"],
+    mask: Bool[Tensor, "views height width"] | None = None,
+) -> Float[Tensor, "channels channels"]:
+    """G = F^T F of all views together, divided by channels x cells.
+
+    The paper's Eqs. 3-6 sum over views and add matrices of different layers; read here as one Gram
+    per layer, averaged over views. With a mask, only its cells are summed and counted, so the share
+    of the frame that the object fills doesn't matter. An empty mask gives zeros.
+    """
+    views, channels, height, width = features.shape
+    cells = features.permute(0, 2, 3, 1).reshape(views, height * width, channels)
+    if mask is None:
+        count = views * height * width
+    else:
+        keep = mask.reshape(views, height * width, 1)
+        cells = cells * keep.to(cells.dtype)
+        count = keep.sum().clamp(min=1)
+    # Views are summed in float32: with bfloat16 features that keeps the sum's own rounding small.
+    per_view = torch.bmm(cells.transpose(1, 2), cells).float()
+    return per_view.sum(0) / (channels * count)
+
+
+def layer_mask(
+    coverage: Float[Tensor, "views height width"], shape: tuple[int, int], erosion: int
+) -> Bool[Tensor, "views cells_y cells_x"]:
+    """Cells of a layer that see only foreground: wholly covered, and ``erosion`` cells from the
+    nearest cell that is not. The frame's own border does not erode."""
+    hole = functional.adaptive_max_pool2d((1 - coverage.detach())[:, None], shape)
+    if erosion:
+        hole = functional.max_pool2d(hole, 2 * erosion + 1, stride=1, padding=erosion)
+    return hole[:, 0] < 0.5
+
+
+class StyleLoss:
+    """Measures images in the encoder's Gram matrices and compares them with a target."""
+
+    def __init__(self, config: LossConfig, encoder: Encoder):
+        self.config = config
+        self.encoder = encoder
+        self.layers = encoder.resolve(config.layers)
+        self.weights = [config.block_weights[int(name[4]) - 1] for name in self.layers]
+
+    def grams(
+        self,
+        images: Float[Tensor, "views height width channels"],
+        coverage: Float[Tensor, "views height width"] | None = None,
+    ) -> Grams:
+        """One Gram per style layer; ``coverage`` limits them to the foreground if so configured."""
+        features = self.encoder(images.permute(0, 3, 1, 2), self.layers)
+        grams = []
+        for layer in self.layers:
+            mask = None
+            if self.config.masked and coverage is not None:
+                height, width = features[layer].shape[2:]
+                mask = layer_mask(coverage, (height, width), self.config.erosion)
+            grams.append(gram_matrix(features[layer], mask))
+        return grams
+
+    def distance(self, grams: Grams, target: Grams) -> Float[Tensor, ""]:
+        """Weighted sum over layers of the squared Frobenius distance (Eq. 8), each relative to the
+        target's squared norm if so configured."""
+        return sum_layers(grams, target, self.weights, self.config.relative)
+
+
+def sum_layers(
+    grams: Grams, target: Grams, weights: Sequence[float], relative: bool
+) -> Float[Tensor, ""]:
+    """The distance that `StyleLoss.distance` documents."""
+    total = grams[0].new_zeros(())
+    for gram, goal, weight in zip(grams, target, weights, strict=True):
+        scale = goal.square().sum().clamp(min=1e-30) if relative else 1.0
+        total = total + weight * (gram - goal).square().sum() / scale
+    return total

@@ -1,0 +1,180 @@
+"""A run's folder: its status, its record, its metrics, its checkpoints.
+
+Every file but ``metrics.jsonl`` is written whole or not at all: to a temporary name beside it, then
+moved over it.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from styleexp.errors import UserError
+
+if TYPE_CHECKING:
+    from styleexp.stylize import State, Step
+
+SCHEMA = 1
+"""Version of the run folder's layout."""
+
+PACKAGES = ("styleexp", "torch", "numpy", "trimesh", "hydra-core", "omegaconf", "safetensors")
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Reads and writes one run's files."""
+
+    path: Path
+
+    @property
+    def checkpoint(self) -> Path:
+        """The latest checkpoint."""
+        return self.path / "checkpoint.safetensors"
+
+    @property
+    def metrics(self) -> Path:
+        """One JSON line a step."""
+        return self.path / "metrics.jsonl"
+
+    def write_status(self, status: str, **more: Any) -> None:
+        """``status.json``: "running", "done", "interrupted" or "failed", with the reason."""
+        self.write_json("status.json", {"schema": SCHEMA, "status": status, "time": now(), **more})
+
+    def write_json(self, name: str, content: Mapping[str, Any]) -> None:
+        """Write a JSON file whole."""
+        text = json.dumps(content, indent=2, default=str) + "\n"
+        self.write(name, lambda path: path.write_text(text, encoding="utf-8"))
+
+    def write(self, name: str, writer: Callable[[Path], Any]) -> Path:
+        """Let ``writer`` write a file under a temporary name, then move it into place."""
+        target = self.path / name
+        # The suffix stays last: writers choose the format by it.
+        partial = target.with_name(f".{target.stem}.{os.getpid()}.partial{target.suffix}")
+        try:
+            writer(partial)
+            with open(partial, "rb") as written:
+                os.fsync(written.fileno())
+            os.replace(partial, target)
+        finally:
+            partial.unlink(missing_ok=True)
+        return target
+
+    def append_metrics(self, step: Step) -> None:
+        """Add a step's line."""
+        with open(self.metrics, "a", encoding="utf-8") as lines:
+            lines.write(json.dumps(asdict(step)) + "\n")
+
+    def truncate_metrics(self, step: int) -> None:
+        """Drop lines after ``step``: a resumed run will write them again."""
+        if not self.metrics.exists():
+            return
+        kept = []
+        for line in self.metrics.read_text(encoding="utf-8").splitlines():
+            try:
+                if json.loads(line)["step"] <= step:
+                    kept.append(line + "\n")
+            except (ValueError, KeyError, TypeError):
+                continue  # a line cut off by the interruption
+        self.write("metrics.jsonl", lambda path: path.write_text("".join(kept), encoding="utf-8"))
+
+    def save_checkpoint(self, state: State) -> None:
+        """Field, optimiser and step in one safetensors file; the one before is kept beside it."""
+        from safetensors.torch import save_file
+
+        tensors = {f"field.{k}": v.contiguous() for k, v in state.field.state_dict().items()}
+        for index, slots in state.optimizer.state_dict()["state"].items():
+            tensors |= {f"adam.{index}.{k}": v.contiguous() for k, v in slots.items()}
+        if self.checkpoint.exists():
+            os.replace(self.checkpoint, self.path / "checkpoint.previous.safetensors")
+        metadata = {"schema": str(SCHEMA), "step": str(state.step)}
+        self.write(
+            "checkpoint.safetensors", lambda path: save_file(tensors, path, metadata=metadata)
+        )
+
+    def load_checkpoint(self, state: State) -> str | None:
+        """Bring ``state`` to the latest readable checkpoint; returns what to tell the user.
+
+        A damaged checkpoint is passed over for the one before it. With none, ``state`` stays as it
+        is, at step 0.
+        """
+        told = None
+        for path in (self.checkpoint, self.path / "checkpoint.previous.safetensors"):
+            if not path.exists():
+                continue
+            try:
+                _restore(path, state)
+                return told
+            except Exception as damage:  # safetensors raises several kinds
+                told = f"{path} is damaged ({damage}); the checkpoint before it is used."
+        return told
+
+
+def _restore(path: Path, state: State) -> None:
+    from safetensors import safe_open
+
+    with safe_open(path, framework="pt") as opened:
+        step = int(opened.metadata()["step"])
+        tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+    device = next(state.field.parameters()).device
+    weights = {k[6:]: v.to(device) for k, v in tensors.items() if k.startswith("field.")}
+    slots: dict[int, dict[str, Any]] = {}
+    for name, tensor in tensors.items():
+        if name.startswith("adam."):
+            _, index, key = name.split(".")
+            slots.setdefault(int(index), {})[key] = tensor
+    groups = state.optimizer.state_dict()["param_groups"]
+    state.field.load_state_dict(weights)
+    state.optimizer.load_state_dict({"state": slots, "param_groups": groups})
+    state.step = step
+
+
+def describe(config: Any, overrides: list[str], command: list[str]) -> dict[str, Any]:
+    """What a reader needs to reproduce a run, apart from what the run itself finds out."""
+    return {
+        "schema": SCHEMA,
+        "started": now(),
+        "command": command,
+        "overrides": overrides,
+        "config": asdict(config),
+        "versions": {"python": platform.python_version(), **_versions()},
+        "platform": {"system": platform.platform(), "machine": platform.machine()},
+    }
+
+
+def _versions() -> dict[str, str | None]:
+    found: dict[str, str | None] = {}
+    for name in PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = None
+    return found
+
+
+def now() -> str:
+    """The time, UTC, ISO 8601."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """The ``run.json`` of a folder; a `UserError` where there is none that can be read."""
+    path = folder / "run.json"
+    if not path.is_file():
+        raise UserError(f"cannot resume '{folder}': it has no run.json, so it is no run's folder.")
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        if record["schema"] != SCHEMA:
+            raise UserError(
+                f"'{path}' has layout {record['schema']}, this version reads {SCHEMA}: "
+                "use the version of styleexp that wrote it."
+            )
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(f"'{path}' cannot be read ({error}): start the run anew.") from error
+    return record

@@ -1,0 +1,142 @@
+"""Where the mesh is on the screen and which way its surface points.
+
+Everything here is laid out as one array per coordinate ("structure of arrays"): gathers and
+scatters along one dimension are several times faster in torch than those of short rows.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+    from torch import Tensor
+
+    from styleexp.renderers.base import Cameras
+
+_TINY_SQUARED = 1e-30  # squared length under which a vector has no direction
+
+
+def pixel_projection(
+    cameras: Cameras, resolution: tuple[int, int], like: Tensor
+) -> Float[Tensor, "3 views 4"]:
+    """Matrices from world points ``(x, y, z, 1)`` to homogeneous pixels ``(column w, row w, w)``.
+
+    ``w`` is the depth of ``RenderOutput.depth``; dividing by it gives pixel coordinates, in which
+    pixel (r, c) has its centre at ``(c + 0.5, r + 0.5)``. Dtype and device are those of ``like``.
+    """
+    height, width = resolution
+    rotation, translation = (
+        cameras.rotation.detach().to(like),
+        cameras.translation.detach().to(like),
+    )
+    focal, center = cameras.focal.detach().to(like), cameras.center.detach().to(like)
+    right, up, backward = torch.cat([rotation, translation[:, :, None]], dim=2).unbind(1)
+    x = focal[:, :1] * right - (center[:, :1] + 1) * backward
+    y = -focal[:, 1:] * up + (center[:, 1:] - 1) * backward
+    return torch.stack([0.5 * width * x, 0.5 * height * y, -backward])
+
+
+class Project(torch.autograd.Function):
+    """Vertices (V, 3) and ``pixel_projection`` matrices to homogeneous pixels (3, views, V).
+
+    Elementwise forward, so that a view's bits do not depend on the others in the batch; a matrix
+    product would choose its kernel by the batch size. The matrices get no gradient.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, vertices: Tensor, matrix: Tensor) -> Tensor:
+        """Map every vertex into every view."""
+        x, y, z = vertices.t().contiguous()
+        columns = matrix.unsqueeze(-1)
+        points = torch.addcmul(columns[:, :, 3], columns[:, :, 0], x)
+        points.addcmul_(columns[:, :, 1], y).addcmul_(columns[:, :, 2], z)
+        ctx.save_for_backward(matrix)
+        return points
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        """Sum over views of each view's transposed matrix."""
+        (matrix,) = ctx.saved_tensors
+        rows = matrix[:, :, :3].reshape(-1, 3)
+        return grad.reshape(rows.shape[0], -1).t() @ rows, None
+
+
+class FaceNormals(torch.autograd.Function):
+    """Vertices (V, 3) and corner indices (3, F) to area-weighted face normals (3, F).
+
+    The length is twice the area; the direction is outside for counter-clockwise faces.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, vertices: Tensor, corners: Tensor) -> Tensor:
+        """Cross product of two edges of every face."""
+        points = [
+            [axis.index_select(0, corner) for axis in vertices.t().contiguous()]
+            for corner in corners
+        ]
+        a = [second - first for first, second in zip(points[0], points[1], strict=True)]
+        b = [third - first for first, third in zip(points[0], points[2], strict=True)]
+        ctx.save_for_backward(corners, *a, *b)
+        ctx.count = vertices.shape[0]
+        return torch.stack(_cross(a, b))
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        """Gradient of the cross product, summed into the corners."""
+        corners, *edges = ctx.saved_tensors
+        grads = grad.unbind(0)
+        to_second, to_third = _cross(edges[3:], grads), _cross(grads, edges[:3])
+        out = grad.new_zeros(3, ctx.count)
+        for axis in range(3):
+            out[axis].index_add_(0, corners[1], to_second[axis])
+            out[axis].index_add_(0, corners[2], to_third[axis])
+            out[axis].index_add_(0, corners[0], to_second[axis] + to_third[axis], alpha=-1)
+        return out.t(), None
+
+
+class SumAtVertices(torch.autograd.Function):
+    """Values of faces (3, F) and corner indices (3, F) to their sums at the vertices (3, V)."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, corners: Tensor, count: int) -> Tensor:
+        """Add each face's value to its three corners."""
+        ctx.save_for_backward(corners)
+        out = values.new_zeros(3, count)
+        for axis in range(3):
+            for corner in corners:
+                out[axis].index_add_(0, corner, values[axis])
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        """Each face collects the gradients of its corners."""
+        (corners,) = ctx.saved_tensors
+        rows = grad.contiguous()
+        out = [sum(row.index_select(0, corner) for corner in corners) for row in rows]
+        return torch.stack(out), None, None  # type: ignore[arg-type]
+
+
+def unit(vectors: Float[Tensor, "3 n"]) -> Float[Tensor, "3 n"]:
+    """Vectors of length one; those too short to have a direction become 0 and pass no gradient."""
+    squared = (vectors * vectors).sum(0)
+    has_direction = squared > _TINY_SQUARED
+    scale = torch.where(has_direction, squared, 1.0).rsqrt()
+    return vectors * torch.where(has_direction, scale, 0.0)
+
+
+def vertex_normals(
+    face_normals: Float[Tensor, "3 faces"], corners: Int[Tensor, "3 faces"], count: int
+) -> Float[Tensor, "3 vertices"]:
+    """Unit normals of the vertices, their faces weighted by area."""
+    return unit(SumAtVertices.apply(face_normals, corners, count))
+
+
+def _cross(a: Any, b: Any) -> list[Tensor]:
+    return [
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    ]

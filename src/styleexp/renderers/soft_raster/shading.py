@@ -1,0 +1,171 @@
+"""Light on the visible surface: the differentiable intensities of the covered pixels.
+
+The light is turned into the world once, so that normals need not be turned into every camera.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from styleexp.renderers.soft_raster.geometry import unit, vertex_normals
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+    from torch import Tensor
+
+    from styleexp.renderers.base import Cameras, Shading
+    from styleexp.renderers.soft_raster.raster import Visible
+
+
+def world_light(cameras: Cameras, shading: Shading, like: Tensor) -> Float[Tensor, "views 3"]:
+    """Each view's light, direction times strength, in world coordinates."""
+    light = torch.as_tensor(shading.light).detach().to(like).expand(len(cameras), 3)
+    return (light[:, :, None] * cameras.rotation.detach().to(like)).sum(1)
+
+
+def flat_intensities(
+    face_normals: Float[Tensor, "3 faces"],
+    visible: Visible,
+    light: Float[Tensor, "views 3"],
+    shading: Shading,
+) -> Float[Tensor, "winners"]:
+    """Intensity of each winner from its face's normal (area-weighted ones are given)."""
+    lit = light @ unit(face_normals)
+    intensity = (shading.albedo * (shading.ambient + lit)).clamp(0, 1)
+    return PickOne.apply(intensity, visible.view * intensity.shape[1] + visible.face)
+
+
+def smooth_intensities(
+    points: Float[Tensor, "3 views vertices"],
+    face_normals: Float[Tensor, "3 faces"],
+    corners: Int[Tensor, "3 faces"],
+    visible: Visible,
+    light: Float[Tensor, "views 3"],
+    shading: Shading,
+) -> Float[Tensor, "winners"]:
+    """Intensity of each winner from vertex normals interpolated over its face."""
+    normals = vertex_normals(face_normals, corners, points.shape[2])
+    height, width = visible.face_ids.shape[1:]
+    within = visible.pixel - visible.view * (height * width)
+    row = within // width
+    column = within - row * width
+    return SmoothLight.apply(
+        points,
+        normals,
+        corners.index_select(1, visible.face),
+        visible.view,
+        torch.stack([column, row]).to(points.dtype) + 0.5,
+        light.index_select(0, visible.view).t(),
+        shading.albedo,
+        shading.ambient,
+    )
+
+
+class PickOne(torch.autograd.Function):
+    """``values.view(-1)[index]`` whose gradient is summed without sorting."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, index: Tensor) -> Tensor:
+        """Gather."""
+        ctx.save_for_backward(index)
+        ctx.shape = values.shape
+        return values.reshape(-1).index_select(0, index)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        """Scatter."""
+        (index,) = ctx.saved_tensors
+        out = grad.new_zeros(ctx.shape)
+        out.view(-1).index_add_(0, index, grad)
+        return out, None
+
+
+class SmoothLight(torch.autograd.Function):
+    """Interpolate vertex normals at pixels and light them, in one step.
+
+    The arguments are the homogeneous pixels (3, views, V) and unit normals (3, V) of the vertices,
+    then, of n pixels, the three vertices (3, n), the view (n), the centre (2, n) and the light
+    (3, n), and the two constants of the shading. Returns the intensities (n).
+
+    The weight of a vertex is the cross product of the other two vertices' offsets from the pixel's
+    ray, ``(x w - column w, y w - row w)``. That is the perspective-correct barycentric coordinate
+    times a common factor, which normalising the normal removes; it needs no division by w and so
+    holds for faces that reach behind the camera.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        points: Tensor,
+        normals: Tensor,
+        corners: Tensor,
+        view: Tensor,
+        center: Tensor,
+        light: Tensor,
+        albedo: float,
+        ambient: float,
+    ) -> Tensor:
+        """Weights, normal, light."""
+        views, count = points.shape[1:]
+        flat = points.reshape(3, views * count)
+        first = view * count
+        right, down, corner_normals = [], [], []
+        for corner in corners:
+            index = first + corner
+            w = flat[2].index_select(0, index)
+            right.append(flat[0].index_select(0, index).addcmul_(center[0], w, value=-1))
+            down.append(flat[1].index_select(0, index).addcmul_(center[1], w, value=-1))
+            corner_normals.append(normals.index_select(1, corner))
+        weights = [down[j] * right[k] - right[j] * down[k] for j, k in ((1, 2), (2, 0), (0, 1))]
+        normal = weights[0] * corner_normals[0]
+        for weight, corner_normal in zip(weights[1:], corner_normals[1:], strict=True):
+            normal.addcmul_(weight, corner_normal)
+        squared = (normal * normal).sum(0)
+        inverse = torch.where(squared > 0, squared, 1.0).rsqrt()
+        normal *= inverse
+        lit = (normal * light).sum(0)
+        raw = albedo * (ambient + lit)
+        unclamped = (raw >= 0) & (raw <= 1)
+        ctx.save_for_backward(
+            corners,
+            view,
+            center,
+            light,
+            normal,
+            lit,
+            torch.where(unclamped, albedo * inverse, 0.0),
+            *weights,
+            *right,
+            *down,
+            *corner_normals,
+        )
+        ctx.shapes = points.shape, normals.shape
+        return raw.clamp_(0, 1)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        """Back through light, normalisation and weights to positions and normals."""
+        corners, view, center, light, normal, lit, scale, *rest = ctx.saved_tensors
+        weights, right, down, corner_normals = rest[:3], rest[3:6], rest[6:9], rest[9:]
+        points_shape, normals_shape = ctx.shapes
+        to_normal = torch.addcmul(light, normal, lit, value=-1).mul_(grad * scale)
+        to_normals = grad.new_zeros(normals_shape)
+        to_points = grad.new_zeros(points_shape)
+        flat = to_points.view(3, -1)
+        to_weight = [(to_normal * corner_normal).sum(0) for corner_normal in corner_normals]
+        first = view * points_shape[2]
+        for i, corner in enumerate(corners):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            share = to_normal * weights[i]
+            for axis in range(3):
+                to_normals[axis].index_add_(0, corner, share[axis])
+            # The vertex enters the weights of the other two.
+            to_right = to_weight[j] * down[k] - to_weight[k] * down[j]
+            to_down = to_weight[k] * right[j] - to_weight[j] * right[k]
+            index = first + corner
+            flat[0].index_add_(0, index, to_right)
+            flat[1].index_add_(0, index, to_down)
+            flat[2].index_add_(0, index, center[0] * to_right + center[1] * to_down, alpha=-1)
+        return to_points, to_normals, None, None, None, None, None, None

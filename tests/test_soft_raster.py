@@ -1,0 +1,240 @@
+"""The default renderer: the conformance body, and what only this backend promises."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+from torch.autograd import gradcheck
+
+from styleexp import testing
+from styleexp.errors import UserError
+from styleexp.renderers.base import Shading
+from styleexp.renderers.soft_raster import SoftRaster
+from styleexp.renderers.soft_raster.contour import (
+    Blend,
+    CrossingDistance,
+    Crossings,
+    neighbours,
+)
+from styleexp.renderers.soft_raster.geometry import (
+    FaceNormals,
+    Project,
+    SumAtVertices,
+    unit,
+)
+from styleexp.renderers.soft_raster.shading import PickOne, SmoothLight
+
+
+class HardRaster(SoftRaster):
+    """The variant without visibility gradients, declared as such."""
+
+    capabilities = replace(SoftRaster.capabilities, differentiable_visibility=False)
+
+    def __init__(self) -> None:
+        super().__init__("none")
+
+
+@pytest.mark.parametrize("renderer", [SoftRaster(), HardRaster()], ids=["contour", "none"])
+@pytest.mark.parametrize("check", testing.CHECKS, ids=lambda check: check.__name__)
+def test_conformance(renderer: SoftRaster, check: testing.Check) -> None:
+    try:
+        check(renderer)
+    except testing.NotApplicable as reason:
+        pytest.skip(str(reason))
+
+
+def test_check_renderer_reports_all_failures() -> None:
+    class Upside(SoftRaster):
+        def render(self, *arguments):  # type: ignore[no-untyped-def]
+            out = super().render(*arguments)
+            return replace(out, image=out.image.flip(1), face_ids=out.face_ids.flip(1))
+
+    with pytest.raises(AssertionError, match="orientation"):
+        testing.check_renderer(Upside())
+
+
+def test_unknown_names_are_user_errors() -> None:
+    with pytest.raises(UserError, match="contour"):
+        SoftRaster("countour")
+    vertices, faces = testing.icosphere(0)
+    with pytest.raises(UserError, match="smooth"):
+        SoftRaster().render(
+            vertices, faces, testing._front_camera(), Shading(normals="smoth"), (4, 4)
+        )
+
+
+def _random(*shape: int, seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+
+def test_gradcheck_project() -> None:
+    vertices = _random(5, 3).requires_grad_()
+    assert gradcheck(Project.apply, (vertices, _random(3, 2, 4, seed=1)))
+
+
+def test_gradcheck_normals() -> None:
+    corners = torch.tensor([[0, 1, 2], [1, 2, 3], [2, 4, 4]])
+    vertices = _random(5, 3).requires_grad_()
+    assert gradcheck(FaceNormals.apply, (vertices, corners))
+    assert gradcheck(lambda v: unit(FaceNormals.apply(v, corners)), (vertices,))
+    values = _random(3, 3, seed=1).requires_grad_()
+    assert gradcheck(lambda v: SumAtVertices.apply(v, corners, 5), (values,))
+
+
+def test_gradcheck_pick_one() -> None:
+    values = _random(2, 4).requires_grad_()
+    assert gradcheck(PickOne.apply, (values, torch.tensor([3, 3, 0, 7])))
+
+
+def test_gradcheck_smooth_light() -> None:
+    points = (_random(3, 2, 5) + torch.tensor([0, 0, 1.0])[:, None, None]).requires_grad_()
+    normals = (_random(3, 5, seed=1) + 0.2).requires_grad_()
+    corners = torch.tensor([[0, 1, 2, 0], [1, 2, 3, 4], [2, 4, 0, 3]])
+    view = torch.tensor([0, 1, 1, 0])
+    center, light = _random(2, 4, seed=2), _random(3, 4, seed=3)
+
+    def intensity(points: Tensor, normals: Tensor) -> Tensor:
+        return SmoothLight.apply(points, normals, corners, view, center, light, 0.4, 0.9)
+
+    assert ((intensity(points, normals) > 0) & (intensity(points, normals) < 1)).all()
+    assert gradcheck(intensity, (points, normals))
+
+
+def test_gradcheck_crossing_distance() -> None:
+    # Edges through the middle of rows and columns; the last reaches behind the camera.
+    x = torch.tensor([0.4, 0.8, 1.1, 0.2, 0.7, 0.9], dtype=torch.float64)
+    y = torch.tensor([0.1, 1.2, 0.8, 0.7, 0.2, 3.0], dtype=torch.float64)
+    w = torch.tensor([1.0, 1.3, 0.8, 1.6, 1.1, -0.5], dtype=torch.float64)
+    points = torch.stack([x * w, y * w, w]).view(3, 2, 3).requires_grad_()
+    index = torch.zeros(4, dtype=torch.long)
+    crossings = Crossings(
+        inner=index,
+        outer=index + 1,
+        start=torch.tensor([0, 2, 1, 4]),
+        end=torch.tensor([1, 3, 0, 5]),
+        center=torch.tensor([[0.2, 0.6, 1.2, 0.2], [0.6, 0.3, 0.5, 0.4]], dtype=torch.float64),
+        along_row=torch.tensor([True, False, True, True]),
+        direction=torch.tensor([1.0, 1.0, -1.0, 1.0], dtype=torch.float64),
+    )
+    distance = CrossingDistance.apply(points, crossings)
+    assert ((distance > 0) & (distance < 1)).all(), distance
+    assert gradcheck(lambda p: CrossingDistance.apply(p, crossings), (points,))
+
+
+def test_gradcheck_blend() -> None:
+    values = _random(2, 9).requires_grad_()
+    # Pixel 4 is taken from all sides, more than once over.
+    distance = torch.tensor([0.1, 0.15, 0.2, 0.05, 0.9], dtype=torch.float64, requires_grad=True)
+    inner, outer = torch.tensor([4, 4, 4, 4, 0]), torch.tensor([1, 3, 5, 7, 1])
+    assert gradcheck(lambda v, d: Blend.apply(v, d, inner, outer), (values, distance))
+    mixed = Blend.apply(values, distance, inner, outer)
+    assert (mixed.amax(1) <= values.amax(1)).all()
+    assert (mixed.amin(1) >= values.amin(1)).all()
+
+
+@pytest.mark.parametrize("normals", ["flat", "smooth"])
+def test_gradcheck_of_shading_through_the_renderer(normals: str) -> None:
+    """Hard visibility does not change under tiny steps, so the whole render is checked."""
+    vertices, faces = testing.bumpy_sphere(1)
+    camera = testing._cameras(2)
+    assert gradcheck(
+        lambda v: (
+            SoftRaster("none").render(v, faces, camera, Shading(normals=normals), (9, 9)).image
+        ),
+        (vertices.double().requires_grad_(),),
+    )
+
+
+def test_double_precision_agrees_with_single() -> None:
+    vertices, faces = testing.bumpy_sphere(3)
+    arguments = (faces, testing._cameras(2), Shading(normals="smooth"), (64, 64))
+    single = SoftRaster().render(vertices, *arguments)
+    double = SoftRaster().render(vertices.double(), *arguments)
+    assert double.image.dtype == double.coverage.dtype == torch.float64
+    assert ((double.image - single.image).abs() > 1e-3).double().mean() < 1e-3
+
+
+@pytest.mark.parametrize("normals", ["flat", "smooth"])
+def test_same_input_same_bits(normals: str) -> None:
+    vertices, faces = testing.bumpy_sphere(4)
+
+    def run() -> tuple[Tensor, Tensor]:
+        moved = vertices.clone().requires_grad_()
+        out = SoftRaster().render(
+            moved, faces, testing._cameras(3), Shading(normals=normals), (100, 100)
+        )
+        (gradient,) = torch.autograd.grad((out.image**2).sum() + out.coverage.sum(), moved)
+        return out.image.detach(), gradient
+
+    first, second = run(), run()
+    assert torch.equal(first[0], second[0])
+    assert torch.equal(first[1], second[1])
+
+
+def test_large_and_small_faces_test_pixels_alike() -> None:
+    """The two paths of the rasteriser, dense boxes and rows, agree on every pixel of a view."""
+    from styleexp.renderers.soft_raster import raster
+
+    vertices, faces = testing.bumpy_sphere(2)
+    arguments = (vertices, faces, testing._cameras(2), Shading(), (90, 70))
+    boxes = SoftRaster("none").render(*arguments)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(raster, "_BOX_SIZES", (1,))
+        rows = SoftRaster("none").render(*arguments)
+        patch.setattr(raster, "_CHUNK", 500)
+        chunked = SoftRaster("none").render(*arguments)
+    for other in (rows, chunked):
+        assert torch.equal(other.face_ids, boxes.face_ids)
+        assert torch.equal(other.image, boxes.image)
+        assert torch.allclose(other.depth, boxes.depth)
+
+
+def test_outlines_are_antialiased_and_hard_without() -> None:
+    vertices, faces = testing.icosphere(4)
+    arguments = (vertices, faces, testing._cameras(1), Shading(), (64, 64))
+    soft, hard = SoftRaster().render(*arguments), SoftRaster("none").render(*arguments)
+    assert set(hard.coverage.unique().tolist()) == {0.0, 1.0}
+    between = (soft.coverage > 0.01) & (soft.coverage < 0.99)
+    assert 60 < between.sum() < 300
+    assert torch.equal(soft.face_ids, hard.face_ids)
+
+
+def test_topology_follows_the_faces() -> None:
+    """The remembered neighbours are those of the faces given, also if changed in place."""
+    vertices, faces = testing.bumpy_sphere(2)
+    renderer, arguments = SoftRaster(), (testing._cameras(1), Shading(), (40, 40))
+    renderer.render(vertices, faces, *arguments)
+    faces[: len(faces) // 2] = faces[0].clone()
+    again = renderer.render(vertices, faces, *arguments)
+    assert torch.equal(again.image, SoftRaster().render(vertices, faces, *arguments).image)
+
+
+def test_neighbours_of_a_strip() -> None:
+    faces = torch.tensor([[0, 1, 2], [2, 1, 3], [2, 3, 4]])
+    none = 3
+    expected = [[none, 0, 1], [1, none, none], [none, 2, none]]
+    assert neighbours(faces, 5).tolist() == expected
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("normals", ["flat", "smooth"])
+def test_cuda_equals_cpu(normals: str) -> None:
+    vertices, faces = testing.bumpy_sphere(4)
+    results = []
+    for device in ("cpu", "cuda"):
+        moved = vertices.to(device).requires_grad_()
+        cameras = testing._cameras(3)
+        out = SoftRaster().render(
+            moved, faces.to(device), cameras, Shading(normals=normals), (100, 100)
+        )
+        (gradient,) = torch.autograd.grad((out.image**2).sum() + out.coverage.sum(), moved)
+        results.append((out.image.detach().cpu(), out.face_ids.cpu(), gradient.cpu()))
+    (image, ids, gradient), (cuda_image, cuda_ids, cuda_gradient) = results
+    assert (ids != cuda_ids).float().mean() < 1e-4
+    assert ((image - cuda_image).abs() > 1e-3).float().mean() < 1e-3
+    relative = (gradient - cuda_gradient).norm() / gradient.norm()
+    assert relative < 0.02
