@@ -25,7 +25,7 @@ from styleexp.renderers.soft_raster.geometry import (
     SumAtVertices,
     unit,
 )
-from styleexp.renderers.soft_raster.shading import PickOne, SmoothLight
+from styleexp.renderers.soft_raster.shading import PickOne, InterpolateAndLight
 
 
 class HardRaster(SoftRaster):
@@ -98,7 +98,7 @@ def test_gradcheck_smooth_light() -> None:
     center, light = _random(2, 4, seed=2), _random(3, 4, seed=3)
 
     def intensity(points: Tensor, normals: Tensor) -> Tensor:
-        return SmoothLight.apply(points, normals, corners, view, center, light, 0.4, 0.9)
+        return InterpolateAndLight.apply(points, normals, corners, view, center, light, 0.4, 0.9)
 
     assert ((intensity(points, normals) > 0) & (intensity(points, normals) < 1)).all()
     assert gradcheck(intensity, (points, normals))
@@ -119,6 +119,8 @@ def test_gradcheck_crossing_distance() -> None:
         center=torch.tensor([[0.2, 0.6, 1.2, 0.2], [0.6, 0.3, 0.5, 0.4]], dtype=torch.float64),
         along_row=torch.tensor([True, False, True, True]),
         direction=torch.tensor([1.0, 1.0, -1.0, 1.0], dtype=torch.float64),
+        view=torch.tensor([0, 0, 0, 1]),
+        face=index,
     )
     distance = CrossingDistance.apply(points, crossings)
     assert ((distance > 0) & (distance < 1)).all(), distance
@@ -130,8 +132,13 @@ def test_gradcheck_blend() -> None:
     # Pixel 4 is taken from all sides, more than once over.
     distance = torch.tensor([0.1, 0.15, 0.2, 0.05, 0.9], dtype=torch.float64, requires_grad=True)
     inner, outer = torch.tensor([4, 4, 4, 4, 0]), torch.tensor([1, 3, 5, 7, 1])
-    assert gradcheck(lambda v, d: Blend.apply(v, d, inner, outer), (values, distance))
-    mixed = Blend.apply(values, distance, inner, outer)
+
+    def blend(values: Tensor, distance: Tensor) -> Tensor:
+        outline = values[:, inner].detach()  # the gradient is then the forward's own
+        return Blend.apply(values, distance, outline, inner, outer)
+
+    assert gradcheck(blend, (values, distance))
+    mixed = blend(values, distance)
     assert (mixed.amax(1) <= values.amax(1)).all()
     assert (mixed.amin(1) >= values.amin(1)).all()
 

@@ -85,5 +85,5 @@ $APP_CONFIG_GROUPS
 Keys, with their values for these choices (key=value, e.g. optim.steps=50):
 $CONFIG
 The run's folder: hydra.run.dir=FOLDER. Tracebacks: debug=true. Completion:
-eval "$(styleexp -sc install=bash)". Hydra's own flags: --hydra-help
+eval "$$(styleexp -sc install=bash)". Hydra's own flags: --hydra-help
 """

@@ -34,6 +34,9 @@ class StyleConfig:
     """A mesh or image file; wins over ``name``."""
     scale: float = 1.0
     """Size of the pattern on the result: 2 makes its features twice as large."""
+    scale_by: str = "area"
+    """Mesh styles: what ``scale`` 1 means. ``area``: the result carries as many features as the style
+    mesh. ``frame``: both meshes fill the unit sphere, as in the paper."""
     image_contrast: float | None = 0.12
     """Image styles: standard deviation that the picture's tone is brought to (it sets the height of
     the relief); null keeps the picture's own contrast."""
@@ -102,7 +105,7 @@ class ViewsConfig:
     spread: str = "around"
     """``normal``: azimuth from the normal distribution, as in the paper. ``around``: azimuth spread
     evenly around the object, so that its back is styled too."""
-    perspective: float = 0.5
+    perspective: float = 0.0
     """Distortion of the random perspective (omega_global); 0 is off."""
     perspective_probability: float = 0.8
     perspective_fill: float = 1.0
@@ -153,8 +156,10 @@ class LossConfig:
     """Grams over the foreground only, divided by its area, not over the whole frame."""
     erosion: int = 2
     """Cells taken off the mask's rim at every layer; they see the background."""
-    relative: bool = True
-    """Divide each layer's squared distance by the target's squared norm."""
+    relative: str = "source"
+    """What each layer's squared distance is divided by: ``none``, as in the paper; ``target``, the
+    squared norm of the target; ``source``, the source mesh's own distance, so that every layer
+    starts at about 1."""
     target: str = "bank"
     """``bank``: the style's Grams are averaged once over a bank of views. ``same_views``: the style
     mesh is rendered at the result's views in every step, as in the paper."""

@@ -84,7 +84,9 @@ class DisplacementField(nn.Module):
 
 
 def zero_mean(
-    displacement: Float[Tensor, " vertices"], areas: Float[Tensor, " vertices"]
+    displacement: Float[Tensor, " vertices"], areas: Float[Tensor, " vertices"], bound: float
 ) -> Float[Tensor, " vertices"]:
-    """Subtract the area-weighted mean, so that the mesh neither grows nor shrinks as a whole."""
-    return displacement - (displacement * areas).sum() / areas.sum()
+    """Subtract the area-weighted mean, so that the mesh neither grows nor shrinks as a whole, and
+    keep the bound."""
+    mean = (displacement * areas).sum() / areas.sum()
+    return (displacement - mean).clamp(-bound, bound)

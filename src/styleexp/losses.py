@@ -8,8 +8,6 @@ import torch
 from torch.nn import functional
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from jaxtyping import Bool, Float
     from torch import Tensor
 
@@ -79,18 +77,29 @@ class StyleLoss:
             grams.append(gram_matrix(features[layer], mask))
         return grams
 
-    def distance(self, grams: Grams, target: Grams) -> Float[Tensor, ""]:
-        """Weighted sum over layers of the squared Frobenius distance (Eq. 8), each relative to the
-        target's squared norm if so configured."""
-        return sum_layers(grams, target, self.weights, self.config.relative)
+    def distance(self, grams: Grams, target: Grams, scales: list[Tensor]) -> Float[Tensor, ""]:
+        """Weighted sum over layers of the squared Frobenius distance (Eq. 8), each divided by its
+        scale."""
+        total = grams[0].new_zeros(())
+        for gram, goal, weight, scale in zip(grams, target, self.weights, scales, strict=True):
+            total = total + weight * (gram - goal).square().sum() / scale
+        return total
 
+    def scales(self, target: Grams, source: Grams) -> list[Tensor]:
+        """The divisor of each layer's distance: see ``LossConfig.relative``.
 
-def sum_layers(
-    grams: Grams, target: Grams, weights: Sequence[float], relative: bool
-) -> Float[Tensor, ""]:
-    """The distance that `StyleLoss.distance` documents."""
-    total = grams[0].new_zeros(())
-    for gram, goal, weight in zip(grams, target, weights, strict=True):
-        scale = goal.square().sum().clamp(min=1e-30) if relative else 1.0
-        total = total + weight * (gram - goal).square().sum() / scale
-    return total
+        Infinite, so that the layer doesn't count, where the target is empty: at its resolution no
+        cell sees foreground alone.
+        """
+        divisors = []
+        for goal, own in zip(target, source, strict=True):
+            norm = goal.square().sum()
+            if self.config.relative == "none":
+                scale = torch.ones_like(norm)
+            elif self.config.relative == "target":
+                scale = norm
+            else:
+                # A layer in which source and style hardly differ must not drown the others.
+                scale = torch.maximum((own - goal).square().sum(), 0.02 * norm)
+            divisors.append(torch.where(norm > 0, scale, torch.inf))
+        return divisors

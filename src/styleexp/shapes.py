@@ -103,7 +103,7 @@ def _gap(count: int) -> float:
 def _wave(directions: np.ndarray, frequency: int, height: float) -> np.ndarray:
     # Gaussians on a hexagonal lattice, wide enough to overlap: nearly a sum of cosines, and without
     # a preferred direction, which the spirals of a Fibonacci lattice would have.
-    centers, _ = _icosphere(frequency)
+    centers = _icosphere(frequency)[0][:, [1, 0, 2]]  # turned, so as not to lie on the rails' nodes
     sharpness = 1.0 / (0.30 * _gap(len(centers))) ** 2
     total = np.exp(sharpness * (directions @ centers.T - 1.0)).sum(axis=1)
     mean = len(centers) / (2.0 * sharpness)  # of the sum over the sphere

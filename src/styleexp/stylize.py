@@ -58,6 +58,8 @@ class Scene:
     viewer: Viewer
     loss: StyleLoss
     target: StyleTarget
+    scales: tuple[list[Tensor], list[Tensor]]
+    """What the distances of the global and the local views are divided by, for each layer."""
     notes: tuple[str, ...] = ()
     """What the user should know: repairs, a mesh too coarse for the style."""
 
@@ -146,7 +148,7 @@ def prepare(config: Config) -> Scene:
             style_faces,
             style_normals,
             light=light,
-            scale=config.style.scale,
+            scale=config.style.scale * scale_unit(config.style, source, style),
             seed=seed,
         )
         target: StyleTarget
@@ -168,6 +170,8 @@ def prepare(config: Config) -> Scene:
                 picture, config.style, config.views, config.loss.bank_views, seed
             )
         target = styles.FixedTarget(loss, batches)
+    own = styles.FixedTarget(loss, styles.mesh_bank(viewer, vertices, config.loss.bank_views))(0)
+    goal = target(0)
     return Scene(
         config,
         source,
@@ -180,6 +184,7 @@ def prepare(config: Config) -> Scene:
         viewer,
         loss,
         target,
+        (loss.scales(goal[0], own[0]), loss.scales(goal[1], own[1])),
         source.repairs,
     )
 
@@ -208,8 +213,12 @@ def optimise(scene: Scene, state: State) -> Iterator[Step]:
             generated = generated / generated.detach().norm(dim=1).max()
         whole, local = scene.viewer(generated, state.step)
         whole_target, local_target = scene.target(state.step)
-        loss_global = loss.distance(loss.grams(whole.image, whole.coverage), whole_target)
-        loss_local = loss.distance(loss.grams(local.image, local.coverage), local_target)
+        loss_global = loss.distance(
+            loss.grams(whole.image, whole.coverage), whole_target, scene.scales[0]
+        )
+        loss_local = loss.distance(
+            loss.grams(local.image, local.coverage), local_target, scene.scales[1]
+        )
         total = loss.config.lambda_global * loss_global + loss.config.lambda_local * loss_local
 
         state.optimizer.zero_grad()
@@ -242,7 +251,9 @@ def displace(
     if config.progressive > 0:
         opened = min(1.0, state.step / (config.progressive * scene.config.optim.steps))
     displacement = state.field(state.field.encode(scene.vertices, opened), precision)
-    return zero_mean(displacement, scene.areas) if config.zero_mean else displacement
+    if config.zero_mean:
+        displacement = zero_mean(displacement, scene.areas, config.bound)
+    return displacement
 
 
 def finish(scene: Scene, state: State) -> Result:
@@ -256,6 +267,17 @@ def finish(scene: Scene, state: State) -> Result:
         displacement.cpu().numpy() * radius,
         scene.source.vertices + offset.cpu().numpy() * radius,
     )
+
+
+def scale_unit(config: StyleConfig, source: meshes.Mesh, style: meshes.Mesh) -> float:
+    """What ``style.scale=1`` magnifies the style mesh by: see ``StyleConfig.scale_by``."""
+    if config.scale_by == "frame":
+        return 1.0
+    areas = [
+        meshes.face_areas(m.vertices, m.faces).sum() / meshes.normalisation(m.vertices).scale ** 2
+        for m in (source, style)
+    ]
+    return float(np.sqrt(areas[0] / areas[1]))
 
 
 def point_at(part: SourceConfig | StyleConfig, what: str | Path) -> None:

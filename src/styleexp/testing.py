@@ -1,8 +1,8 @@
 """Conformance checks for rendering backends, ours and yours.
 
-Every check takes a ``Renderer``, says in its docstring what must hold, and raises ``AssertionError``
-where it does not. It raises ``NotApplicable`` where the backend does not claim, in its
-``capabilities`` or by what it returns, what the check is about. In a test-suite::
+Every check takes a ``Renderer``, says in its docstring what must hold, and raises
+``AssertionError`` where it does not. It raises ``NotApplicable`` where the backend does not claim,
+in its ``capabilities`` or by what it returns, what the check is about. In a test-suite::
 
     @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
     def test_conformance(check):
@@ -34,7 +34,7 @@ EVEN = Shading(albedo=0.25, ambient=1.0, light=(0.0, 0.0, 0.0))
 """Every surface has intensity 0.25: what is left of a picture is its outline."""
 
 
-class NotApplicable(Exception):  # noqa: N818  (not an error: the check has nothing to say)
+class NotApplicable(Exception):
     """The backend does not claim what the check is about."""
 
 
@@ -569,13 +569,16 @@ def _render(
 ) -> RenderOutput:
     """Render on the backend's first device, and bring the result back to the CPU."""
     device = renderer.capabilities.devices[0]
-    moved = [
-        t.to(device) for t in (cameras.rotation, cameras.translation, cameras.focal, cameras.center)
-    ]
     out = renderer.render(
         vertices.to(device),
         faces.to(device),
-        Cameras(*moved, near=cameras.near),
+        replace(
+            cameras,
+            rotation=cameras.rotation.to(device),
+            translation=cameras.translation.to(device),
+            focal=cameras.focal.to(device),
+            center=cameras.center.to(device),
+        ),
         shading or Shading(),
         size,
     )

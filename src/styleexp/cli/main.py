@@ -79,28 +79,29 @@ def _hydra() -> None:
         sys.exit(max(failures))
 
 
-def explain(error: Exception) -> str:
+def explain(error: BaseException) -> str:
     """Hydra's complaint as one or two sentences, with the nearest known name."""
     text = str(error)
-    missing = re.search(r"Could not find '([\w/]+)/([^'/]+)'", text)
-    if missing:
-        from styleexp import compose
+    while error.__cause__ is not None:  # Hydra wraps OmegaConf's, which says more
+        error = error.__cause__
+        text += f"\n{error}"
+    choice = re.search(r"Could not find '([\w/]+)/([^'/]+)'", text)
+    if choice:
         from styleexp.errors import unknown_name
 
-        compose.register()
-        return str(unknown_name(missing[1], missing[2], _options(missing[1])))
-    key = re.search(r"Key '(\w+)' (?:is not in struct|not in '(\w+)')", text)
+        return str(unknown_name(choice[1], choice[2], _options(choice[1])))
+    key = re.search(r"Key '(\w+)' (?:is )?not in", text)
     if key:
         from styleexp.config import Config
 
-        known = sorted(_keys(Config))
+        known = _keys(Config)
         near = difflib.get_close_matches(key[1], [k.split(".")[-1] for k in known], n=1)
         full = [k for k in known if near and k.split(".")[-1] == near[0]]
         hint = f"did you mean {' or '.join(full)}? " if full else ""
         return f"there is no key '{key[1]}': {hint}'styleexp --help' lists the keys."
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    where = next((line for line in lines if line.startswith("full_key:")), "")
-    return " ".join([lines[0] if lines else type(error).__name__, where]).strip()
+    told = [x for x in lines if not x.startswith(("full_key", "object_type", "reference_type"))]
+    return ": ".join(dict.fromkeys(told)) or type(error).__name__
 
 
 def _options(group: str) -> list[str]:

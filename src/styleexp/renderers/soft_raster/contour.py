@@ -1,10 +1,10 @@
 """Anti-aliased outlines, which carry the gradient of visibility.
 
 An outline is made of contour edges: those of a front face whose neighbour across the edge faces
-away or does not exist. Where such an edge passes between the centres of two neighbouring pixels, at
-a distance ``s`` (in pixels) from the one on the inside, the part ``s - 0.5`` of the outer pixel takes
-the inner pixel's colour or, where that is negative, the part ``0.5 - s`` of the inner pixel takes the
-outer one's. The sum over the two moves with ``s`` by their difference in colour, which is the
+away or does not exist. Take such an edge between the centres of two neighbouring pixels, at a
+distance ``s`` (in pixels) from the one on its inside: the outer pixel is given the inner one's
+colour by the part ``s - 0.5`` or, where that is negative, the inner pixel the outer one's by
+``0.5 - s``. The sum over the two moves with ``s`` by their difference in colour, which is the
 derivative of what an area-averaging camera sees.
 
 Searching edges rather than the visible triangles' neighbours matters: with faces smaller than
@@ -15,12 +15,12 @@ pixels only the outermost counts.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
 
-from styleexp.renderers.soft_raster.raster import ragged
+from styleexp.renderers.soft_raster.raster import chunks, ragged
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -33,18 +33,21 @@ if TYPE_CHECKING:
 class Crossings:
     """Outline edges between two neighbouring pixels, n of them."""
 
-    inner: Int[Tensor, "n"]
+    inner: Int[Tensor, " n"]
     """Index of the pixel on the inside of the edge, into the flattened (views, height, width)."""
-    outer: Int[Tensor, "n"]
-    start: Int[Tensor, "n"]
+    outer: Int[Tensor, " n"]
+    start: Int[Tensor, " n"]
     """Index of the edge's first vertex into the flattened (views, vertices)."""
-    end: Int[Tensor, "n"]
+    end: Int[Tensor, " n"]
     center: Float[Tensor, "2 n"]
     """Centre of the inner pixel (column, row)."""
-    along_row: Bool[Tensor, "n"]
+    along_row: Bool[Tensor, " n"]
     """Whether the two pixels are neighbours in a row (or else in a column)."""
-    direction: Float[Tensor, "n"]
+    direction: Float[Tensor, " n"]
     """+1 where the outer pixel is to the right or below, -1 where to the left or above."""
+    view: Int[Tensor, " n"]
+    face: Int[Tensor, " n"]
+    """The front face whose edge it is."""
 
 
 def neighbours(faces: Int[Tensor, "faces 3"], count: int) -> Int[Tensor, "3 faces"]:
@@ -64,6 +67,25 @@ def neighbours(faces: Int[Tensor, "faces 3"], count: int) -> Int[Tensor, "3 face
     return torch.where(found, order[place] % number, number).view(3, number)
 
 
+@dataclass(frozen=True)
+class _Segments:
+    """The parts of edges in front of the near plane, m of them, and the scan lines they meet."""
+
+    p: Float[Tensor, "3 m"]
+    """One end in pixels, and 1/w there; the other end is ``q``."""
+    q: Float[Tensor, "3 m"]
+    view: Int[Tensor, " m"]
+    face: Int[Tensor, " m"]
+    start: Int[Tensor, " m"]
+    end: Int[Tensor, " m"]
+    along_row: Bool[Tensor, " m"]
+    """Steep: its scan lines are rows; those of the others are columns."""
+    first: Int[Tensor, " m"]
+    """First scan line whose pixel centres it passes between."""
+    count: Int[Tensor, " m"]
+    """How many scan lines there are."""
+
+
 @torch.no_grad()
 def find_crossings(
     points: Float[Tensor, "3 views vertices"],
@@ -75,126 +97,148 @@ def find_crossings(
     near: float,
 ) -> Crossings:
     """All places where a visible contour edge separates two pixels."""
-    start, end, view = _contour_edges(points, corners, across, front, pairs)
-    found = _pixel_pairs(points, start, end, view, near, visible.depth)
-    return _outermost(found, visible.depth)
+    edges = _contour_edges(points, corners, across, front, pairs)
+    segments = _segments(points, *edges, near, visible.depth)
+    found, distances = [], []
+    begin = 0
+    for size in chunks(segments.count):
+        part = _part(segments, slice(begin, begin + size))
+        crossings, distance = _seen_crossings(part, visible.depth)
+        found.append(crossings)
+        distances.append(distance)
+        begin += size
+    columns = [[getattr(crossings, f.name) for crossings in found] for f in fields(Crossings)]
+    every = Crossings(*(torch.cat(column, dim=-1) for column in columns))
+    return _part(every, _outermost(every, torch.cat(distances)))
+
+
+def _part(record: Any, index: slice | Tensor) -> Any:
+    """Pick elements of each tensor of a record, along its last dimension."""
+    return replace(record, **{f.name: getattr(record, f.name)[..., index] for f in fields(record)})
 
 
 def _contour_edges(
     points: Tensor, corners: Tensor, across: Tensor, front: Tensor, pairs: FacePairs
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Edges (start, end as indices into (views, vertices), and view) of front faces only."""
+) -> tuple[Tensor, ...]:
+    """View, face, and start and end in (views, vertices) of the edges that front faces end at."""
     views, number = front.shape
     known = torch.cat([front, front.new_zeros(views, 1)], dim=1).view(-1)
     first = pairs.view * (number + 1)
-    starts, ends, seen = [], [], []
+    found = []
     for k in range(3):
         beyond = first + across[k].index_select(0, pairs.face)
         edge = (~known.index_select(0, beyond)).nonzero().view(-1)
         view, face = pairs.view[edge], pairs.face[edge]
         base = view * points.shape[2]
-        starts.append(base + corners[k].index_select(0, face))
-        ends.append(base + corners[(k + 1) % 3].index_select(0, face))
-        seen.append(view)
-    return torch.cat(starts), torch.cat(ends), torch.cat(seen)
+        start = base + corners[k].index_select(0, face)
+        end = base + corners[(k + 1) % 3].index_select(0, face)
+        found.append((view, face, start, end))
+    return tuple(torch.cat(parts) for parts in zip(*found, strict=True))
 
 
-def _pixel_pairs(
-    points: Tensor, start: Tensor, end: Tensor, view: Tensor, near: float, depth: Tensor
-) -> tuple[Crossings, Tensor, Tensor]:
-    """Pixel pairs that the edges pass between; also ``s`` and 1/w there. Not yet tested for sight."""
+def _segments(
+    points: Tensor,
+    view: Tensor,
+    face: Tensor,
+    start: Tensor,
+    end: Tensor,
+    near: float,
+    depth: Tensor,
+) -> _Segments:
+    """Cut edges at the near plane, project them and choose their scan lines."""
     height, width = depth.shape[1:]
     flat = points.reshape(3, -1)
     a, b = flat.index_select(1, start), flat.index_select(1, end)
-    # Only the part in front of the near plane is searched; the crossing is that of the whole line.
     rise = b[2] - a[2]
     cut = a + ((near - a[2]) / torch.where(rise == 0, 1.0, rise)) * (b - a)
     a_front, b_front = a[2] >= near, b[2] >= near
     p, q = torch.where(a_front, a, cut), torch.where(b_front, b, cut)
-    p, q = p[:2] / p[2].clamp_min(near), q[:2] / q[2].clamp_min(near)
-    dx, dy = q - p
-    along_row = dy.abs() >= dx.abs()
+    p, q = [
+        torch.cat([end[:2], torch.ones_like(end[2:])]) / end[2].clamp_min(near) for end in (p, q)
+    ]
+    along_row = (q[1] - p[1]).abs() >= (q[0] - p[0]).abs()
 
-    # Scan lines: rows for steep edges, columns for the others.
-    low, high = torch.minimum(p, q), torch.maximum(p, q)
-    lines = torch.where(along_row, height, width).to(p.dtype)
-    first = torch.ceil(torch.where(along_row, low[1], low[0]) - 0.5).clamp_min(0)
-    last = torch.ceil(torch.where(along_row, high[1], high[0]) - 0.5).minimum(lines) - 1
-    counts = torch.where(a_front | b_front, last - first + 1, 0.0).clamp_min(0).long()
-    owner, step = ragged(counts)
+    from_p, from_q = torch.where(along_row, p[1], p[0]), torch.where(along_row, q[1], q[0])
+    lines = torch.where(along_row, height, width)
+    first = torch.ceil(torch.minimum(from_p, from_q) - 0.5).clamp_min(0)
+    beyond = torch.minimum(torch.ceil(torch.maximum(from_p, from_q) - 0.5), lines)
+    count = torch.where(a_front | b_front, beyond - first, 0.0).nan_to_num(nan=0.0).clamp_min(0)
+    return _Segments(p, q, view, face, start, end, along_row, first.long(), count.long())
 
-    along_row = along_row[owner]
-    line = first.long()[owner] + step
-    dx, dy = dx[owner], dy[owner]
-    run, rise = torch.where(along_row, dx, dy), torch.where(along_row, dy, dx)
-    from_p, from_line = torch.where(along_row, p[:, owner], p[:, owner].flip(0))
-    share = ((line.to(p.dtype) + 0.5 - from_line) / rise).clamp(0, 1)
-    crossing = from_p + share * run
+
+def _seen_crossings(segments: _Segments, depth: Tensor) -> tuple[Crossings, Tensor]:
+    """Where segments pass between two pixels, in front of the farther; and the distances ``s``."""
+    height, width = depth.shape[1:]
+    owner, step = ragged(segments.count)
+    p, q = segments.p.index_select(1, owner), segments.q.index_select(1, owner)
+    along_row = segments.along_row.index_select(0, owner)
+    line = segments.first.index_select(0, owner) + step
+    # u runs along the scan line, v across it.
+    p_u, p_v = torch.where(along_row, p[0], p[1]), torch.where(along_row, p[1], p[0])
+    q_u, q_v = torch.where(along_row, q[0], q[1]), torch.where(along_row, q[1], q[0])
+    share = ((line.to(p.dtype) + 0.5 - p_v) / (q_v - p_v)).clamp(0, 1)
+    crossing = torch.lerp(p_u, q_u, share)
+    inverse_w = torch.lerp(p[2], q[2], share)
+
     # The pair's first pixel is left of, or above, the crossing.
     before = torch.floor(crossing - 0.5)
-    limit = torch.where(along_row, width, height) - 1
-    kept = ((before >= 0) & (before < limit)).nonzero().view(-1)
-    owner, along_row, line, share = owner[kept], along_row[kept], line[kept], share[kept]
-    crossing, before = crossing[kept], before[kept]
-    # Counter-clockwise front faces are right of edges that go down (dy > 0), above those that go right.
-    inner_after = torch.where(along_row, dy[kept] > 0, dx[kept] < 0)
+    in_frame = (before >= 0) & (before < torch.where(along_row, width, height) - 1)
+    before = torch.where(in_frame, before, 0.0)
     fraction = crossing - before - 0.5
-    distance = torch.where(inner_after, 1 - fraction, fraction)
+    # A front face is to the right of its edges that go down, below those that go left.
+    inner_last = (q_v > p_v) == along_row
+    distance = torch.where(inner_last, 1 - fraction, fraction)
 
-    base = view[owner] * (height * width)
-    stride = torch.where(along_row, 1, width)
-    pixel = base + torch.where(along_row, line * width, line) + before.long() * stride
-    inner = torch.where(inner_after, pixel + stride, pixel)
-    outer = torch.where(inner_after, pixel, pixel + stride)
-    inner_step = (before + inner_after.to(before.dtype)) + 0.5
-    center_line = line.to(before.dtype) + 0.5
-    center = torch.stack(
-        [
-            torch.where(along_row, inner_step, center_line),
-            torch.where(along_row, center_line, inner_step),
-        ]
-    )
-    direction = torch.where(inner_after, -1.0, 1.0).to(points.dtype)
-    inverse = torch.lerp(
-        1 / torch.where(a_front, a[2], near)[owner],
-        1 / torch.where(b_front, b[2], near)[owner],
-        share,
-    )
-    found = Crossings(inner, outer, start[owner], end[owner], center, along_row, direction)
-    return found, distance, inverse
-
-
-def _outermost(found: tuple[Crossings, Tensor, Tensor], depth: Tensor) -> Crossings:
-    """Keep what is in front of the farther pixel, and of that the outermost edge of each pair."""
-    crossings, distance, inverse_w = found
+    column = torch.where(along_row, before.long(), line)
+    row = torch.where(along_row, line, before.long())
+    pixel = (segments.view.index_select(0, owner) * height + row) * width + column
+    following = pixel + torch.where(along_row, 1, width)
+    inner = torch.where(inner_last, following, pixel)
+    outer = torch.where(inner_last, pixel, following)
     flat = depth.reshape(-1)
-    inner_depth, outer_depth = flat[crossings.inner], flat[crossings.outer]
-    seen = (inner_depth < outer_depth) & (inverse_w * outer_depth > 1)
-    # Of a row's and a column's pair the first pixel is the same; tell them apart by the parity.
-    pair = torch.minimum(crossings.inner, crossings.outer) * 2 + crossings.along_row
-    bits = distance.float().clamp(0, 1).view(torch.int32).long()
-    rank = torch.arange(bits.numel(), device=bits.device)
-    key = torch.where(seen, ((bits + 1) << 32) | rank, 0)
-    best = key.new_zeros(2 * flat.numel())
-    best.scatter_reduce_(0, pair, key, "amax")
-    kept = (seen & (best[pair] == key)).nonzero().view(-1)
-    return Crossings(
-        crossings.inner[kept],
-        crossings.outer[kept],
-        crossings.start[kept],
-        crossings.end[kept],
-        crossings.center[:, kept],
-        crossings.along_row[kept],
-        crossings.direction[kept],
+    last_pixel = max(flat.numel() - 1, 0)
+    inner_depth = flat.index_select(0, inner.clamp_max(last_pixel))
+    outer_depth = flat.index_select(0, outer.clamp_max(last_pixel))
+    seen = in_frame & (inner_depth < outer_depth) & (inverse_w * outer_depth > 1)
+
+    kept = seen.nonzero().view(-1)
+    shift = inner_last.to(p.dtype)
+    crossings = Crossings(
+        inner[kept],
+        outer[kept],
+        segments.start[owner[kept]],
+        segments.end[owner[kept]],
+        torch.stack(
+            [
+                column[kept] + torch.where(along_row, shift, 0.0)[kept] + 0.5,
+                row[kept] + torch.where(along_row, 0.0, shift)[kept] + 0.5,
+            ]
+        ),
+        along_row[kept],
+        1 - 2 * shift[kept],
+        segments.view[owner[kept]],
+        segments.face[owner[kept]],
     )
+    return crossings, distance[kept]
+
+
+def _outermost(crossings: Crossings, distance: Tensor) -> Int[Tensor, " pixel_pairs"]:
+    """The index of the outermost edge between each pair of pixels."""
+    # A row's and a column's pair may have the same first pixel; the parity tells them apart.
+    pair = torch.minimum(crossings.inner, crossings.outer) * 2 + crossings.along_row
+    fine = 1 << 20  # steps of distance, and the outermost edge of each pair comes last
+    order = (pair * (2 * fine) + (distance.clamp(0, 1) * fine).long()).argsort(stable=True)
+    pair = pair[order]
+    last = torch.cat([pair[1:] != pair[:-1], pair.new_ones(min(len(pair), 1), dtype=torch.bool)])
+    return order[last]
 
 
 class CrossingDistance(torch.autograd.Function):
     """Distance in pixels from each inner pixel's centre to its edge, towards the outer pixel.
 
-    Takes homogeneous pixels (3, views, V) and ``Crossings``; returns (n). With the vertices' offsets
-    from the pixel's ray, ``(x w - column w, y w - row w)``, the line through both needs no division
-    by their depths, and so holds for edges that reach behind the camera.
+    Takes homogeneous pixels (3, views, V) and ``Crossings``; returns (n). With the vertices'
+    offsets from the pixel's ray, ``(x w - column w, y w - row w)``, the line through both needs no
+    division by their depths, and so holds for edges that reach behind the camera.
     """
 
     @staticmethod
@@ -212,18 +256,14 @@ class CrossingDistance(torch.autograd.Function):
         usable = below != 0
         scale = torch.where(usable, crossings.direction / torch.where(usable, below, 1.0), 0.0)
         distance = (a_u * b_v - b_u * a_v) * scale
-        # Rounding may put it a hair outside of the pair.
-        within = (distance >= 0) & (distance <= 1)
         ctx.crossings, ctx.shape = crossings, points.shape
-        ctx.save_for_backward(
-            a[2], b[2], a_u, a_v, b_u, b_v, scale, distance * crossings.direction, within
-        )
-        return distance.clamp(0, 1)
+        ctx.save_for_backward(a[2], b[2], a_u, a_v, b_u, b_v, scale, distance * crossings.direction)
+        return distance.clamp(0, 1)  # rounding may put it a hair outside of the pair
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
         """Quotient rule, summed into the two vertices."""
-        a_w, b_w, a_u, a_v, b_u, b_v, scale, offset, within = ctx.saved_tensors
+        a_w, b_w, a_u, a_v, b_u, b_v, scale, offset = ctx.saved_tensors
         crossings: Crossings = ctx.crossings
         above = grad * scale
         below = -above * offset
@@ -241,46 +281,47 @@ class CrossingDistance(torch.autograd.Function):
 
 
 class Blend(torch.autograd.Function):
-    """Mix pixels across outlines: values (channels, pixels), distances (n), inner and outer (n).
+    """Mix pixels across outlines.
 
-    A pixel takes the part ``|s - 0.5|`` of its neighbour; if its neighbours' parts come to more than
-    one they are scaled to one, so that a result never leaves the range of what it mixes.
+    Takes values (channels, pixels) and, of n crossings, the distances ``s`` (n), the values right at
+    the outline, on its inside (channels, n), and the inner and outer pixels (n). A pixel takes the
+    part ``|s - 0.5|`` of its neighbour; if its neighbours' parts come to more than one they are
+    scaled to one, so that a result never leaves the range of what it mixes.
+
+    What an outline sweeps over changes from the outer pixel's value to that at the outline. That,
+    not the value half a pixel inside, makes the derivative by the distance: on a round object
+    shading changes fast towards the outline, and the inner pixel's would be up to 15 % off.
     """
 
     @staticmethod
-    def forward(ctx: Any, values: Tensor, distance: Tensor, inner: Tensor, outer: Tensor) -> Tensor:
-        """Add each part of the difference to the neighbour's colour."""
+    def forward(
+        ctx: Any, values: Tensor, distance: Tensor, outline: Tensor, inner: Tensor, outer: Tensor
+    ) -> Tensor:
+        """Add each part of the difference to the neighbour's value."""
         shrinks = distance < 0.5
         target, source = torch.where(shrinks, inner, outer), torch.where(shrinks, outer, inner)
         part = (distance - 0.5).abs()
         total = part.new_zeros(values.shape[1]).index_add_(0, target, part).index_select(0, target)
         scale = 1 / total.clamp_min(1)
-        difference = values.index_select(1, source) - values.index_select(1, target)
-        change = difference * (part * scale)
+        before = values.index_select(1, target)
+        weight = part * scale
+        change = (values.index_select(1, source) - before) * weight
         out = values.clone()
         for channel, row in enumerate(change):
             out[channel].index_add_(0, target, row)
-        moved = out.index_select(1, target) - values.index_select(1, target)
-        ctx.save_for_backward(
-            target,
-            source,
-            part * scale,
-            scale,
-            difference,
-            torch.where(total > 1, moved, 0.0),
-            shrinks,
-        )
+        # Where parts are scaled, more of one means less of the others.
+        moved = torch.where(total > 1, out.index_select(1, target) - before, 0.0)
+        jump = outline - values.index_select(1, outer) + torch.where(shrinks, moved, -moved)
+        ctx.save_for_backward(target, source, weight, jump * scale)
         return out
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None, None]:
-        """Colours pass through to both pixels, distances feel the difference."""
-        target, source, weight, scale, difference, excess, shrinks = ctx.saved_tensors
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None, None, None]:
+        """Values pass through to both pixels, distances feel the jump."""
+        target, source, weight, jump = ctx.saved_tensors
         at_target = grad.index_select(1, target)
-        to_part = (at_target * (difference - excess)).sum(0) * scale
-        to_distance = torch.where(shrinks, -to_part, to_part)
         to_values = grad.clone()
         for channel, row in enumerate(at_target * weight):
             to_values[channel].index_add_(0, source, row)
             to_values[channel].index_add_(0, target, row, alpha=-1)
-        return to_values, to_distance, None, None
+        return to_values, (at_target * jump).sum(0), None, None, None

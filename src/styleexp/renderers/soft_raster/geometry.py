@@ -116,7 +116,7 @@ class SumAtVertices(torch.autograd.Function):
         (corners,) = ctx.saved_tensors
         rows = grad.contiguous()
         out = [sum(row.index_select(0, corner) for corner in corners) for row in rows]
-        return torch.stack(out), None, None  # type: ignore[arg-type]
+        return torch.stack(out), None, None
 
 
 def unit(vectors: Float[Tensor, "3 n"]) -> Float[Tensor, "3 n"]:

@@ -1,11 +1,11 @@
 """Visibility: which face is seen at which pixel. Nothing here is differentiated.
 
-Faces become triangles in pixel coordinates (``Triangles``), clipped at the near plane; triangles are
+Faces become triangles in pixel coordinates (``Triangles``), clipped at the near plane; these are
 tested against the pixel centres in their bounding boxes; the nearest hit of each pixel wins.
 
-The tests are watertight: the edge function of an edge seen from its two sides is the same number
-with opposite sign, bit for bit, because it is anchored at the edge's midpoint, and a pixel centre on
-an edge belongs to the side given by the top-left rule.
+The tests are watertight: the edge function of an edge is the same number, bit for bit, from its two
+sides, because it is anchored at the edge's midpoint, and a pixel centre on an edge belongs to the
+side given by the top-left rule.
 """
 
 from __future__ import annotations
@@ -23,16 +23,15 @@ _BOX_SIZES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 """Bounding boxes are padded to these sizes; larger ones are filled row by row."""
 _CHUNK = 1 << 20
 """Most pixel candidates that are tested at once: bounds memory, and keeps the work in cache."""
-_FACE_BITS = 0xFFFFFFFF
 
 
 @dataclass(frozen=True)
 class FacePairs:
     """Pairs (view, face) that may be seen: facing the camera and not wholly outside the frame."""
 
-    view: Int[Tensor, "pairs"]
-    face: Int[Tensor, "pairs"]
-    needs_clipping: Bool[Tensor, "pairs"]
+    view: Int[Tensor, " pairs"]
+    face: Int[Tensor, " pairs"]
+    needs_clipping: Bool[Tensor, " pairs"]
     """A corner lies in front of the near plane, or behind the camera."""
 
 
@@ -43,8 +42,8 @@ class Triangles:
     x: Float[Tensor, "3 triangles"]
     y: Float[Tensor, "3 triangles"]
     inverse_w: Float[Tensor, "3 triangles"]
-    view: Int[Tensor, "triangles"]
-    face: Int[Tensor, "triangles"]
+    view: Int[Tensor, " triangles"]
+    face: Int[Tensor, " triangles"]
 
 
 @dataclass(frozen=True)
@@ -53,10 +52,10 @@ class Visible:
 
     face_ids: Int[Tensor, "views height width"]
     depth: Float[Tensor, "views height width"]
-    pixel: Int[Tensor, "winners"]
+    pixel: Int[Tensor, " winners"]
     """Index into the flattened (views, height, width)."""
-    view: Int[Tensor, "winners"]
-    face: Int[Tensor, "winners"]
+    view: Int[Tensor, " winners"]
+    face: Int[Tensor, " winners"]
 
 
 def facing(
@@ -128,7 +127,7 @@ def rasterise(
     bucket = torch.where(has_pixel, bucket, -1)
     for index, size in enumerate(_BOX_SIZES):
         members = (bucket == index).nonzero().view(-1)
-        for part in members.split(max(1, _CHUNK // size**2)):
+        for part in members.split(max(1, _CHUNK // size**2)) if members.numel() else ():
             _test_boxes(best, triangles, part, low_x, low_y, size, resolution)
     members = (bucket == len(_BOX_SIZES)).nonzero().view(-1)
     if members.numel():
@@ -158,10 +157,9 @@ def _triangles(points: Tensor, corners: Tensor, pairs: FacePairs, near: float) -
     homogeneous = torch.stack([flat.index_select(1, i[crossing]) for i in index])
     clipped = _clip(homogeneous, near)
     return Triangles(
-        *(
-            torch.cat([kept[:, rest], new], dim=1)
-            for kept, new in zip((whole.x, whole.y, whole.inverse_w), clipped, strict=True)
-        ),
+        x=torch.cat([whole.x[:, rest], clipped[0]], dim=1),
+        y=torch.cat([whole.y[:, rest], clipped[1]], dim=1),
+        inverse_w=torch.cat([whole.inverse_w[:, rest], clipped[2]], dim=1),
         view=torch.cat([pairs.view[rest], view, view]),
         face=torch.cat([pairs.face[rest], face, face]),
     )
@@ -202,29 +200,46 @@ def _cut(a: Float[Tensor, "3 n"], b: Float[Tensor, "3 n"], near: float) -> Float
 
 
 def _pixel_range(values: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """First and last pixel whose centre lies within the three corners' range and the frame."""
-    low = torch.ceil(values.amin(0) - 0.5).clamp(0, size)
-    high = torch.floor(values.amax(0) - 0.5).clamp(-1, size - 1)
+    """First and last pixel whose centre lies within the three corners' range and the frame.
+
+    None, with a corner that is not a number.
+    """
+    low = torch.ceil(values.amin(0) - 0.5).nan_to_num(nan=size).clamp(0, size)
+    high = torch.floor(values.amax(0) - 0.5).nan_to_num(nan=-1.0).clamp(-1, size - 1)
     return low.long(), high.long()
 
 
-def _edges(x: Tensor, y: Tensor) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
-    """Midpoint and direction (mx, my, dx, dy) of each triangle's three edges."""
+@dataclass(frozen=True)
+class _Edge:
+    """One edge of each triangle, turned so that the pixel centres on it are on its inner side."""
+
+    mx: Tensor
+    my: Tensor
+    dx: Tensor
+    dy: Tensor
+    turned: Tensor
+    """Whether the triangle is on the other side: outside of it, then, means inside."""
+
+
+def _edges(x: Tensor, y: Tensor) -> list[_Edge]:
+    """The edges by their midpoints and directions.
+
+    Of the two directions of an edge one is its own, by the top-left rule: downwards, or to the left
+    where it is level. Two faces that share an edge so do the very same arithmetic for it.
+    """
     result = []
     for a, b in ((0, 1), (1, 2), (2, 0)):
-        result.append(((x[a] + x[b]) * 0.5, (y[a] + y[b]) * 0.5, x[b] - x[a], y[b] - y[a]))
+        dx, dy = x[b] - x[a], y[b] - y[a]
+        turned = (dy < 0) | ((dy == 0) & (dx > 0))
+        sign = 1 - 2 * turned.to(dx.dtype)
+        middle_x, middle_y = (x[a] + x[b]) * 0.5, (y[a] + y[b]) * 0.5
+        result.append(_Edge(middle_x, middle_y, dx * sign, dy * sign, turned))
     return result
 
 
-def _owned_threshold(across: Tensor, dx: Tensor, dy: Tensor) -> Tensor:
-    """Turn ``>`` into ``>=`` for top and left edges, whose pixel centres the triangle owns."""
-    owns = (dy > 0) | ((dy == 0) & (dx < 0))
-    return torch.where(owns, torch.nextafter(across, across.new_tensor(-torch.inf)), across)
-
-
 def _inverse_depth_plane(t: Triangles, part: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
-    """Slopes of 1/w (linear in the image) and its range over each triangle: dx, dy, first, lo, hi."""
-    q = t.inverse_w[:, part]
+    """Slopes of 1/w, which is linear in the image, its first corner's value, and its range."""
+    q = t.inverse_w.index_select(1, part)
     x1, x2, y1, y2 = x[1] - x[0], x[2] - x[0], y[1] - y[0], y[2] - y[0]
     area = x1 * y2 - x2 * y1
     # A sliver's slopes may be anything; its range then bounds the depth.
@@ -250,39 +265,41 @@ def _test_boxes(
 ) -> None:
     """Test dense (size, size) boxes of pixels; the triangles are the innermost dimension."""
     height, width = resolution
-    x, y = t.x[:, part], t.y[:, part]
-    left, top = low_x[part], low_y[part]
-    steps = torch.arange(size, device=part.device)[:, None]
-    column, row = left + steps, top + steps
-    center_x, center_y = column.to(x.dtype) + 0.5, row.to(y.dtype) + 0.5
+    count, device = part.numel(), part.device
+    x, y = t.x.index_select(1, part), t.y.index_select(1, part)
+    # A padded box must not stick out of the frame.
+    left = low_x.index_select(0, part).clamp_max(max(width - size, 0))
+    top = low_y.index_select(0, part).clamp_max(max(height - size, 0))
+    columns, rows = min(size, width), min(size, height)
+    center_x = (left + torch.arange(columns, device=device)[:, None]).to(x.dtype) + 0.5
+    center_y = (top + torch.arange(rows, device=device)[:, None]).to(y.dtype) + 0.5
     inside = None
-    for mx, my, dx, dy in _edges(x, y):
-        along = (center_x - mx) * dy
-        across = _owned_threshold((center_y - my) * dx, dx, dy)
-        positive = along[None, :, :] > across[:, None, :]
-        inside = positive if inside is None else inside.logical_and_(positive)
+    for edge in _edges(x, y):
+        along = (center_x - edge.mx) * edge.dy
+        across = (center_y - edge.my) * edge.dx
+        within = (along[None, :, :] >= across[:, None, :]).logical_xor_(edge.turned)
+        inside = within if inside is None else inside.logical_and_(within)
     assert inside is not None
-    # A padded box may stick out of the frame.
-    inside &= (column < width)[None, :, :]
-    inside &= (row < height)[:, None, :]
     hit = inside.view(-1).nonzero().view(-1)
-    count = part.numel()
+    # Look up what a cell of the box means: cheaper than arithmetic on 64-bit integers.
     cell = hit // count
-    member = hit - cell * count
-    step_y = cell // size
-    step_x = cell - step_y * size
+    row, column = torch.meshgrid(
+        torch.arange(rows, device=device), torch.arange(columns, device=device), indexing="ij"
+    )
+    row, column = row.reshape(-1), column.reshape(-1)
+    member = hit - ((row * columns + column) * count).index_select(0, cell)
 
     slope_x, slope_y, first, lowest, highest = _inverse_depth_plane(t, part, x, y)
     by_x = (slope_x * (center_x - x[0])).view(-1)
     by_y = (slope_y * (center_y - y[0]) + first).view(-1)
-    inverse_w = by_x.index_select(0, step_x * count + member)
-    inverse_w += by_y.index_select(0, step_y * count + member)
+    inverse_w = by_x.index_select(0, (column * count).index_select(0, cell) + member)
+    inverse_w += by_y.index_select(0, (row * count).index_select(0, cell) + member)
     inverse_w = torch.clamp(
         inverse_w, lowest.index_select(0, member), highest.index_select(0, member)
     )
-    corner = (t.view[part] * height + top) * width + left
-    pixel = corner.index_select(0, member) + step_y * width + step_x
-    _keep_nearest(best, pixel, inverse_w, t.face[part].index_select(0, member))
+    corner = (t.view.index_select(0, part) * height + top) * width + left
+    pixel = corner.index_select(0, member) + (row * width + column).index_select(0, cell)
+    _keep_nearest(best, pixel, inverse_w, t.face.index_select(0, part.index_select(0, member)))
 
 
 def _test_rows(
@@ -300,15 +317,20 @@ def _test_rows(
         member = some.index_select(0, owner)
         row = low_y.index_select(0, member) + step
         start, length = _row_spans(t, member, row, width)
-        # Chunks of rows with about _CHUNK pixels each.
-        chunk = torch.div(length.cumsum(0), _CHUNK, rounding_mode="floor")
-        for rows in torch.unique_consecutive(chunk, return_counts=True)[1].tolist():
-            now, member = member[:rows], member[rows:]
-            _test_spans(best, t, now, row[:rows], start[:rows], length[:rows], resolution)
-            row, start, length = row[rows:], start[rows:], length[rows:]
+        begin = 0
+        for rows in chunks(length):
+            now = slice(begin, begin + rows)
+            _test_spans(best, t, member[now], row[now], start[now], length[now], resolution)
+            begin += rows
 
 
-def ragged(counts: Int[Tensor, "n"]) -> tuple[Int[Tensor, "total"], Int[Tensor, "total"]]:
+def chunks(counts: Int[Tensor, " n"]) -> list[int]:
+    """Split items that hold ``counts`` elements each into runs with not many more than _CHUNK."""
+    chunk = torch.div(counts.cumsum(0), _CHUNK, rounding_mode="floor")
+    return torch.unique_consecutive(chunk, return_counts=True)[1].tolist() or [0]
+
+
+def ragged(counts: Int[Tensor, " n"]) -> tuple[Int[Tensor, " total"], Int[Tensor, " total"]]:
     """For items that hold ``counts`` elements each: every element's item and its place therein."""
     owner = torch.repeat_interleave(counts)
     place = torch.arange(owner.numel(), device=counts.device)
@@ -321,10 +343,11 @@ def _row_spans(t: Triangles, member: Tensor, row: Tensor, width: int) -> tuple[T
     x, y = t.x.index_select(1, member), t.y.index_select(1, member)
     center_y = row.to(y.dtype) + 0.5
     low, high = x.amin(0), x.amax(0)
-    for mx, my, dx, dy in _edges(x, y):
-        crossing = mx + dx * ((center_y - my) / dy)
-        low = torch.where(dy > 0, torch.maximum(low, crossing), low)
-        high = torch.where(dy < 0, torch.minimum(high, crossing), high)
+    for edge in _edges(x, y):
+        crossing = edge.mx + edge.dx * ((center_y - edge.my) / edge.dy)
+        level = edge.dy == 0
+        low = torch.where(level | edge.turned, low, torch.maximum(low, crossing))
+        high = torch.where(level | ~edge.turned, high, torch.minimum(high, crossing))
     first = torch.floor(low - 1.5).clamp(0, width)
     last = torch.ceil(high + 0.5).clamp(-1, width - 1)
     return first.long(), (last - first + 1).clamp_min(0).long()
@@ -347,10 +370,10 @@ def _test_spans(
     column = start.index_select(0, owner) + step
     center_x = column.to(x.dtype) + 0.5
     inside = torch.ones_like(owner, dtype=torch.bool)
-    for mx, my, dx, dy in _edges(x, y):
-        across = _owned_threshold((center_y - my) * dx, dx, dy)
-        along = (center_x - mx.index_select(0, owner)) * dy.index_select(0, owner)
-        inside &= along > across.index_select(0, owner)
+    for edge in _edges(x, y):
+        across = (center_y - edge.my) * edge.dx
+        along = (center_x - edge.mx.index_select(0, owner)) * edge.dy.index_select(0, owner)
+        inside &= (along >= across.index_select(0, owner)) ^ edge.turned.index_select(0, owner)
     hit = inside.nonzero().view(-1)
     owner, column, center_x = owner[hit], column[hit], center_x[hit]
 
@@ -368,18 +391,17 @@ def _test_spans(
 
 
 def _keep_nearest(best: Tensor, pixel: Tensor, inverse_w: Tensor, face: Tensor) -> None:
-    """Depth test. Positive floats order as their bits do; the face index breaks ties."""
+    """Depth test. Positive floats order as their bits do; the inverted face index breaks ties."""
     bits = inverse_w.float().view(torch.int32).long()
-    best.scatter_reduce_(0, pixel, (bits << 32) | (_FACE_BITS - face), "amax")
+    best.scatter_reduce_(0, pixel, (bits << 32) | (~face & 0xFFFFFFFF), "amax")
 
 
 def _winners(best: Tensor, shape: tuple[int, int, int], dtype: torch.dtype) -> Visible:
+    """Unpack the keys; the background's, 0, is that of face -1 at infinity."""
+    low, high = best.view(torch.int32).view(-1, 2).unbind(1)  # little-endian, as all of torch is
+    face_ids = low.bitwise_not().long()
+    depth = high.contiguous().view(torch.float32).reciprocal().to(dtype)
     pixel = best.nonzero().view(-1)
-    key = best.index_select(0, pixel)
-    face = _FACE_BITS - (key & _FACE_BITS)
-    face_ids = torch.full_like(best, -1)
-    face_ids[pixel] = face
-    # The background's key is 0, of which the inverse is the background's depth, infinity.
-    depth = 1 / (best >> 32).int().view(torch.float32).to(dtype)
     view = pixel // max(shape[1] * shape[2], 1)
+    face = face_ids.index_select(0, pixel)
     return Visible(face_ids.view(shape), depth.view(shape), pixel, view, face)

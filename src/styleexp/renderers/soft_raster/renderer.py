@@ -16,11 +16,7 @@ from styleexp.renderers.soft_raster.contour import (
 )
 from styleexp.renderers.soft_raster.geometry import FaceNormals, Project, pixel_projection
 from styleexp.renderers.soft_raster.raster import candidate_pairs, facing, rasterise
-from styleexp.renderers.soft_raster.shading import (
-    flat_intensities,
-    smooth_intensities,
-    world_light,
-)
+from styleexp.renderers.soft_raster.shading import FlatSurface, SmoothSurface, world_light
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -71,10 +67,12 @@ class SoftRaster(Renderer):
             visible = rasterise(points, corners, pairs, cameras.near, resolution)
 
         light = world_light(cameras, shading, vertices)
+        surface: FlatSurface | SmoothSurface
         if shading.normals == "flat":
-            intensities = flat_intensities(face_normals, visible, light, shading)
+            surface = FlatSurface(face_normals, light, shading)
         else:
-            intensities = smooth_intensities(points, face_normals, corners, visible, light, shading)
+            surface = SmoothSurface(points, face_normals, corners, light, shading)
+        intensities = surface.at_pixels(visible)
         background = vertices.new_full((visible.depth.numel(),), shading.background)
         image = background.index_copy(0, visible.pixel, intensities)
         coverage = (visible.face_ids >= 0).to(vertices.dtype).view(-1)
@@ -83,8 +81,14 @@ class SoftRaster(Renderer):
             across = self._neighbours(faces, vertices.shape[0])
             edges = find_crossings(points, corners, across, front, pairs, visible, cameras.near)
             distance = CrossingDistance.apply(points, edges)
-            both = torch.stack([image, coverage])
-            image, coverage = Blend.apply(both, distance, edges.inner, edges.outer)
+            colour = surface.at_crossings(edges)
+            image, coverage = Blend.apply(
+                torch.stack([image, coverage]),
+                distance,
+                torch.stack([colour, torch.ones_like(colour)]),
+                edges.inner,
+                edges.outer,
+            )
 
         shape = visible.depth.shape
         return RenderOutput(
@@ -92,7 +96,7 @@ class SoftRaster(Renderer):
         )
 
     def _neighbours(self, faces: Tensor, count: int) -> Int[Tensor, "3 faces"]:
-        """Faces across edges; kept for the last ``faces``, since a fit renders one topology often."""
+        """Faces across edges; remembered, since a fit renders the same topology many times."""
         if self._known is None or self._known[0] is not faces or self._known[1] != faces._version:
             self._known = (faces, faces._version, neighbours(faces.long(), count))
         return self._known[2]

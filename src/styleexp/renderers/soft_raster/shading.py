@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from styleexp.renderers.base import Cameras, Shading
+    from styleexp.renderers.soft_raster.contour import Crossings
     from styleexp.renderers.soft_raster.raster import Visible
 
 
@@ -25,42 +26,80 @@ def world_light(cameras: Cameras, shading: Shading, like: Tensor) -> Float[Tenso
     return (light[:, :, None] * cameras.rotation.detach().to(like)).sum(1)
 
 
-def flat_intensities(
-    face_normals: Float[Tensor, "3 faces"],
-    visible: Visible,
-    light: Float[Tensor, "views 3"],
-    shading: Shading,
-) -> Float[Tensor, "winners"]:
-    """Intensity of each winner from its face's normal (area-weighted ones are given)."""
-    lit = light @ unit(face_normals)
-    intensity = (shading.albedo * (shading.ambient + lit)).clamp(0, 1)
-    return PickOne.apply(intensity, visible.view * intensity.shape[1] + visible.face)
+class FlatSurface:
+    """A surface with one normal a face; its area-weighted normals are given."""
+
+    def __init__(
+        self,
+        face_normals: Float[Tensor, "3 faces"],
+        light: Float[Tensor, "views 3"],
+        shading: Shading,
+    ) -> None:
+        self.normals, self.light, self.shading = unit(face_normals), light, shading
+
+    def at_pixels(self, visible: Visible) -> Float[Tensor, " winners"]:
+        """Intensities of the covered pixels."""
+        lit = self.light @ self.normals
+        intensity = (self.shading.albedo * (self.shading.ambient + lit)).clamp(0, 1)
+        return PickOne.apply(intensity, visible.view * intensity.shape[1] + visible.face)
+
+    def at_crossings(self, crossings: Crossings) -> Float[Tensor, " n"]:
+        """Intensities right at outlines; without gradients."""
+        normal = self.normals.detach().index_select(1, crossings.face)
+        return _lit(normal, crossings.view, self.light, self.shading)
 
 
-def smooth_intensities(
-    points: Float[Tensor, "3 views vertices"],
-    face_normals: Float[Tensor, "3 faces"],
-    corners: Int[Tensor, "3 faces"],
-    visible: Visible,
-    light: Float[Tensor, "views 3"],
-    shading: Shading,
-) -> Float[Tensor, "winners"]:
-    """Intensity of each winner from vertex normals interpolated over its face."""
-    normals = vertex_normals(face_normals, corners, points.shape[2])
-    height, width = visible.face_ids.shape[1:]
-    within = visible.pixel - visible.view * (height * width)
-    row = within // width
-    column = within - row * width
-    return SmoothLight.apply(
-        points,
-        normals,
-        corners.index_select(1, visible.face),
-        visible.view,
-        torch.stack([column, row]).to(points.dtype) + 0.5,
-        light.index_select(0, visible.view).t(),
-        shading.albedo,
-        shading.ambient,
-    )
+class SmoothSurface:
+    """A surface whose unit normals at vertices are interpolated over its faces."""
+
+    def __init__(
+        self,
+        points: Float[Tensor, "3 views vertices"],
+        face_normals: Float[Tensor, "3 faces"],
+        corners: Int[Tensor, "3 faces"],
+        light: Float[Tensor, "views 3"],
+        shading: Shading,
+    ) -> None:
+        self.points, self.corners, self.light, self.shading = points, corners, light, shading
+        self.normals = vertex_normals(face_normals, corners, points.shape[2])
+
+    def at_pixels(self, visible: Visible) -> Float[Tensor, " winners"]:
+        """Intensities of the covered pixels."""
+        height, width = visible.face_ids.shape[1:]
+        within = visible.pixel - visible.view * (height * width)
+        row = within // width
+        column = within - row * width
+        return InterpolateAndLight.apply(
+            self.points,
+            self.normals,
+            self.corners.index_select(1, visible.face),
+            visible.view,
+            torch.stack([column, row]).to(self.points.dtype) + 0.5,
+            self.light.index_select(0, visible.view).t(),
+            self.shading.albedo,
+            self.shading.ambient,
+        )
+
+    def at_crossings(self, crossings: Crossings) -> Float[Tensor, " n"]:
+        """Intensities right at outlines; without gradients."""
+        flat, normals = self.points.detach().reshape(3, -1), self.normals.detach()
+        first = crossings.view * self.points.shape[2]
+        # How far each end is beside the pixels' line: the crossing divides the edge accordingly.
+        axis = crossings.along_row.long()
+        center = crossings.center.gather(0, axis[None])[0]
+        sides, ends = [], []
+        for index in (crossings.start, crossings.end):
+            x, y, w = flat.index_select(1, index)
+            sides.append(torch.where(crossings.along_row, y, x) - center * w)
+            ends.append(normals.index_select(1, index - first))
+        span = sides[0] - sides[1]
+        share = torch.where(span == 0, 0.5, sides[0] / span).clamp(0, 1)
+        return _lit(unit(torch.lerp(*ends, share)), crossings.view, self.light, self.shading)
+
+
+def _lit(normal: Tensor, view: Tensor, light: Tensor, shading: Shading) -> Tensor:
+    lit = (normal * light.index_select(0, view).t()).sum(0)
+    return (shading.albedo * (shading.ambient + lit)).clamp(0, 1)
 
 
 class PickOne(torch.autograd.Function):
@@ -82,7 +121,7 @@ class PickOne(torch.autograd.Function):
         return out, None
 
 
-class SmoothLight(torch.autograd.Function):
+class InterpolateAndLight(torch.autograd.Function):
     """Interpolate vertex normals at pixels and light them, in one step.
 
     The arguments are the homogeneous pixels (3, views, V) and unit normals (3, V) of the vertices,

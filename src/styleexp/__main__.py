@@ -1,0 +1,5 @@
+"""``python -m styleexp``."""
+
+from styleexp.cli.main import main
+
+main()

@@ -1,0 +1,243 @@
+"""The command as a user meets it: real processes, real folders."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+import styleexp
+
+SMOKE = ["profile=smoke", "encoder=vgg19_random"]
+
+
+def command(*arguments, cwd, **more):
+    """Run `styleexp` and return the finished process."""
+    return subprocess.run(
+        [sys.executable, "-m", "styleexp", *map(str, arguments)],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+        **more,
+    )
+
+
+def complaint(done):
+    """The one line on standard error of a refused command."""
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    lines = [line for line in done.stderr.splitlines() if line.strip()]
+    assert len(lines) == 1, done.stderr
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A run's folder, shared by the tests that only look at it."""
+    cwd = tmp_path_factory.mktemp("finished")
+    done = command("source=torus", "style=bubble", *SMOKE, "hydra.run.dir=run", cwd=cwd)
+    assert done.returncode == 0, done.stderr
+    return cwd / "run", done
+
+
+def test_run_leaves_everything(finished):
+    folder, done = finished
+    names = {p.name for p in folder.iterdir()}
+    assert {
+        "status.json", "run.json", "metrics.jsonl", "checkpoint.safetensors", "preview.png",
+        "turntable.gif", "result.ply", "result.obj", "result.glb",
+    } <= names  # fmt: skip
+    assert not [n for n in names if "partial" in n]
+    assert json.loads((folder / "status.json").read_text())["status"] == "done"
+    steps = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    assert [s["step"] for s in steps] == [1, 2, 3, 4]
+    record = json.loads((folder / "run.json").read_text())
+    assert record["config"]["optim"]["steps"] == 4
+    assert record["versions"]["torch"]
+    assert record["device"] == "cpu"
+    assert str(folder / "result.glb") in done.stdout or "run/result.glb" in done.stdout
+
+
+def test_ply_carries_the_displacement(finished):
+    header = (finished[0] / "result.ply").read_bytes()[:600].decode("latin-1")
+    assert "displacement" in header
+
+
+def test_kill_and_resume_is_bit_identical(finished, tmp_path):
+    folder = tmp_path / "killed"
+    arguments = ["source=torus", "style=bubble", *SMOKE, "optim.steps=30", f"hydra.run.dir={folder}"]
+    undisturbed = tmp_path / "whole"
+    assert command(*arguments[:-1], f"hydra.run.dir={undisturbed}", cwd=tmp_path).returncode == 0
+    process = subprocess.Popen([sys.executable, "-m", "styleexp", *arguments], cwd=tmp_path)
+    lines = folder / "metrics.jsonl"
+    deadline = time.monotonic() + 240
+    while not (lines.exists() and lines.read_text().count("\n") >= 5):
+        assert process.poll() is None, "the run ended before it could be killed"
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert json.loads((folder / "status.json").read_text())["status"] == "running"
+    assert not (folder / "result.ply").exists()
+
+    done = command(f"resume={folder}", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "resuming at step" in done.stdout
+    for name in ("result.ply", "result.obj"):
+        assert (folder / name).read_bytes() == (undisturbed / name).read_bytes()
+    steps = [json.loads(line)["step"] for line in lines.read_text().splitlines()]
+    assert steps == list(range(1, 31))
+
+
+def test_interrupt_checkpoints_and_says_how_to_go_on(tmp_path):
+    folder = tmp_path / "run"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "styleexp", "source=torus", "style=bubble", *SMOKE,
+         "optim.steps=400", f"hydra.run.dir={folder}"],
+        cwd=tmp_path, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    lines = folder / "metrics.jsonl"
+    deadline = time.monotonic() + 240
+    while not lines.exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    told, _ = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert f"styleexp resume={folder}" in told
+    status = json.loads((folder / "status.json").read_text())
+    assert status["status"] == "interrupted"
+    assert (folder / "checkpoint.safetensors").exists()
+
+
+def test_damaged_checkpoint_falls_back_to_the_one_before_and_says_so(finished, tmp_path):
+    import shutil
+
+    folder = tmp_path / "run"
+    shutil.copytree(finished[0], folder)
+    checkpoint = folder / "checkpoint.safetensors"
+    checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
+    done = command(f"resume={folder}", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "is damaged" in done.stdout
+    assert (folder / "result.ply").read_bytes() == (finished[0] / "result.ply").read_bytes()
+
+
+def test_resume_refuses_what_is_no_run(tmp_path):
+    assert "no run.json" in complaint(command(f"resume={tmp_path}", cwd=tmp_path))
+    told = complaint(command(f"resume={tmp_path}", "optim.steps=9", cwd=tmp_path))
+    assert "optim.steps=9" in told
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["source=crittr", "style=bubble"], "did you mean 'critter'"),
+        (["source=critter", "style=buble"], "did you mean 'bubble'"),
+        (["source=critter"], "no style was given"),
+        ([], "no source was given"),
+        (["source=critter", "style=bubble", "optim.stps=3"], "optim.steps"),
+        (["source=critter", "style=bubble", "optim.steps=many"], "optim.steps=many"),
+        (["source=critter", "style=bubble", "renderer=kaolin"], "unknown renderer"),
+        (["source.path=nowhere.obj", "style=bubble"], "nowhere.obj"),
+        (["source=critter", "style.path=nowhere.png"], "nowhere.png"),
+        (["source=critter", "style=bubble", "device=cuda:7"], "cuda:7"),
+        (["source=critter", "style=bubble", "loss.layers=[conv9_9]"], "conv9_9"),
+        (["source=critter", "style=bubble", "views.local.mode=sideways"], "sideways"),
+        (["source=critter", "style=bubble", "shading.background=mauve"], "mauve"),
+        (["source=critter", "style=bubble", "optim.steps=0"], "optim.steps"),
+        (["source=critter", "style=bubble", "style.scale=0"], "style.scale"),
+        (["source=critter", "style=bubble", "views.count=0"], "views.count"),
+        (["source=critter", "style=bubble", "field.sigma=-1"], "field.sigma"),
+        (["source=critter", "style=bubble", "loss.block_weights=[1,2]"], "block_weights"),
+        (["source=critter", "style=bubble", "style"], "style"),
+    ],
+)
+def test_mistakes_get_one_sentence(arguments, expected, tmp_path):
+    done = command(*arguments, *SMOKE, "hydra.run.dir=run", cwd=tmp_path)
+    assert expected in complaint(done)
+    assert not (tmp_path / "run" / "result.ply").exists()
+
+
+def test_failure_is_recorded_with_its_reason(tmp_path):
+    (tmp_path / "empty.obj").touch()
+    done = command("source.path=empty.obj", "style=bubble", *SMOKE, "hydra.run.dir=run", cwd=tmp_path)
+    assert "empty.obj" in complaint(done)
+    status = json.loads((tmp_path / "run" / "status.json").read_text())
+    assert status["status"] == "failed"
+    assert "empty.obj" in status["reason"]
+
+
+def test_unwritable_folder(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    done = command("source=torus", "style=bubble", *SMOKE, "hydra.run.dir=file/run", cwd=tmp_path)
+    assert "hydra.run.dir" in complaint(done)
+
+
+def test_full_disk(tmp_path):
+    """The results can't be written: one sentence, and no half of a file left."""
+    import resource
+
+    def limit():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+
+    done = command(
+        "source=torus", "style=bubble", *SMOKE, "hydra.run.dir=run", cwd=tmp_path, preexec_fn=limit
+    )
+    assert "hydra.run.dir" in complaint(done)
+    left = {p.name for p in (tmp_path / "run").iterdir()}
+    assert not left & {"result.ply", "result.obj", "result.glb"}
+    assert not [n for n in left if "partial" in n]
+
+
+def test_debug_shows_the_traceback(tmp_path):
+    done = command("source.path=no.obj", "style=bubble", "debug=true", cwd=tmp_path)
+    assert done.returncode != 0
+    assert "Traceback" in done.stderr
+
+
+def test_works_from_an_empty_folder_with_relative_paths_and_odd_names(tmp_path):
+    from styleexp import meshes, shapes
+
+    torus = shapes.make("torus", detail=800)
+    meshes.save_mesh(torus, torus.vertices, tmp_path / "mein Käse=ring.ply")
+    done = command(
+        "source.path='mein Käse=ring.ply'", "style=bubble", *SMOKE, "hydra.run.dir=run", cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    result = styleexp.load_mesh(tmp_path / "run" / "result.glb")
+    assert np.array_equal(result.faces, torus.faces)
+
+
+def test_help_lists_the_choices_and_loads_nothing_heavy(tmp_path):
+    code = (
+        "import sys; sys.argv = ['styleexp', '--help']\n"
+        "from styleexp.cli.main import main\n"
+        "try: main()\nexcept SystemExit: pass\n"
+        "heavy = {'torch', 'mitsuba', 'moderngl', 'pyrender', 'trimesh', 'scipy', 'onnx'}\n"
+        "print('HEAVY', sorted(heavy & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "HEAVY []" in done.stdout
+    for choice in ("soft_raster", "vgg16", "critter", "bubble", "optim", "hydra.run.dir"):
+        assert choice in done.stdout
+
+
+def test_import_loads_nothing_heavy():
+    code = "import sys, styleexp; print(sorted({'torch', 'numpy', 'hydra'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_shell_completion_knows_the_choices(tmp_path):
+    done = command(
+        "-sc", "query=bash", cwd=tmp_path, env={**os.environ, "COMP_LINE": "styleexp style=bub"}
+    )
+    assert "style=bubble" in done.stdout

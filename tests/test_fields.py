@@ -1,0 +1,66 @@
+import math
+
+import pytest
+import torch
+
+from styleexp.config import FieldConfig
+from styleexp.fields import DisplacementField, FourierFeatures, zero_mean
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def test_encoding_is_equation_1():
+    encode = FourierFeatures(4, 5.0, False, generator())
+    point = torch.tensor([[0.1, -0.2, 0.3]])
+    phase = 2 * math.pi * encode.frequencies @ point[0]
+    torch.testing.assert_close(encode(point)[0], torch.cat([phase.cos(), phase.sin()]))
+
+
+def test_frequencies_have_the_configured_spread_and_do_not_train():
+    encode = FourierFeatures(4096, 5.0, False, generator())
+    assert encode.frequencies.std() == pytest.approx(5.0, rel=0.02)
+    assert not list(encode.parameters())
+
+
+def test_progressive_opening_goes_from_low_to_high_frequencies():
+    encode = FourierFeatures(64, 5.0, True, generator())
+    half = encode(torch.full((1, 3), 0.37), opened=0.5)[0]
+    cosines = half[3 : 3 + 64]
+    assert (cosines[:32] != 0).all()
+    assert (cosines[32:] == 0).all()
+    norms = encode.frequencies.norm(dim=1)
+    assert (norms[1:] >= norms[:-1]).all()
+    assert half[:3].tolist() == pytest.approx([0.37] * 3)  # the raw input is never closed
+
+
+def test_starts_at_the_source_and_keeps_its_bound():
+    field = DisplacementField(FieldConfig(bound=0.1), generator())
+    encoded = field.encode(torch.rand(50, 3))
+    assert (field(encoded) == 0).all()
+    torch.nn.init.constant_(field.layers[-1].bias, 1e3)
+    assert field(encoded).max().item() == pytest.approx(0.1)
+
+
+def test_paper_sizes():
+    field = DisplacementField(FieldConfig(), generator())
+    shapes = [tuple(layer.weight.shape) for layer in field.layers]
+    assert shapes == [(256, 256)] * 7 + [(1, 256)]
+
+
+def test_equal_generators_make_equal_fields_and_others_do_not():
+    def weights(seed):
+        return DisplacementField(FieldConfig(), generator(seed)).layers[0].weight
+
+    assert torch.equal(weights(1), weights(1))
+    assert not torch.equal(weights(1), weights(2))
+
+
+def test_zero_mean_is_weighted_by_area_and_keeps_the_bound():
+    displacement = torch.tensor([0.05, 0.01, -0.02])
+    areas = torch.tensor([1.0, 2.0, 5.0])
+    centred = zero_mean(displacement, areas, 0.1)
+    assert (centred * areas).sum() == pytest.approx(0.0, abs=1e-7)
+    far = zero_mean(torch.tensor([0.1, -0.1, -0.1]), torch.ones(3), 0.1)
+    assert far.abs().max() <= 0.1

@@ -1,0 +1,91 @@
+import pytest
+import torch
+
+from styleexp.config import LossConfig
+from styleexp.encoders import load_encoder
+from styleexp.losses import StyleLoss, gram_matrix, layer_mask
+
+
+def test_gram_is_the_normalised_product_averaged_over_views():
+    features = torch.rand(3, 4, 5, 6)
+    expected = sum(f.reshape(4, 30) @ f.reshape(4, 30).T for f in features) / (3 * 30 * 4)
+    torch.testing.assert_close(gram_matrix(features), expected)
+
+
+def test_masked_gram_sees_the_foreground_alone_and_not_how_large_it_is():
+    features = torch.rand(1, 4, 8, 8)
+    mask = torch.zeros(1, 8, 8, dtype=torch.bool)
+    mask[:, 2:5, 3:7] = True
+    masked = gram_matrix(features, mask)
+    torch.testing.assert_close(masked, gram_matrix(features[:, :, 2:5, 3:7]))
+    features[:, :, 7, 7] = 100.0
+    torch.testing.assert_close(gram_matrix(features, mask), masked)
+
+
+def test_empty_mask_gives_zeros_not_nan():
+    mask = torch.zeros(1, 8, 8, dtype=torch.bool)
+    assert (gram_matrix(torch.rand(1, 4, 8, 8), mask) == 0).all()
+
+
+def test_mask_keeps_whole_cells_and_erodes_from_holes_but_not_from_the_frame():
+    coverage = torch.ones(1, 32, 32)
+    coverage[0, 16, 0] = 0.4  # one half-covered pixel
+    whole = layer_mask(coverage, (8, 8), 0)
+    assert whole.sum() == 63
+    assert not whole[0, 4, 0]
+    eroded = layer_mask(coverage, (8, 8), 1)
+    assert eroded.sum() == 64 - 6
+    assert eroded[0, 0, 7]
+
+
+@pytest.fixture(scope="module")
+def encoder():
+    with pytest.warns(UserWarning, match="random"):
+        return load_encoder("vgg19_random", precision="fp32")
+
+
+def test_the_papers_layers_by_index_and_by_name_are_the_same(encoder):
+    by_index = StyleLoss(LossConfig(layers=[1, 3, 5, 9, 13]), encoder)
+    by_name = StyleLoss(LossConfig(), encoder)
+    assert by_index.layers == by_name.layers
+
+
+def test_distance_is_zero_at_the_target_and_weights_blocks(encoder):
+    images = torch.rand(2, 64, 64, 1)
+    loss = StyleLoss(LossConfig(relative="none", block_weights=[1, 0, 0, 0, 0]), encoder)
+    own, other = loss.grams(images), loss.grams(images.square())
+    scales = loss.scales(own, other)
+    assert loss.distance(own, own, scales) == 0
+    first_layer = (own[0] - other[0]).square().sum()
+    torch.testing.assert_close(loss.distance(other, own, scales), first_layer)
+
+
+def test_relative_to_the_source_starts_every_layer_at_one(encoder):
+    images = torch.rand(2, 64, 64, 1)
+    loss = StyleLoss(LossConfig(relative="source", block_weights=[1] * 5), encoder)
+    target, source = loss.grams(images), loss.grams(1 - images * 0.5)
+    scales = loss.scales(target, source)
+    assert loss.distance(source, target, scales) == pytest.approx(5.0, rel=1e-4)
+
+
+def test_background_does_not_matter_when_masked(encoder):
+    """The outline's influence must not reach past the erosion at the shallow layers."""
+    images = torch.full((1, 64, 64, 1), 0.5)
+    images[:, 16:48, 16:48] = torch.rand(32, 32, 1)
+    coverage = torch.zeros(1, 64, 64)
+    coverage[:, 16:48, 16:48] = 1
+    white = images.clone()
+    white[coverage == 0] = 1.0
+    loss = StyleLoss(LossConfig(layers=["conv1_1", "conv2_1"], erosion=2), encoder)
+    for a, b in zip(loss.grams(images, coverage), loss.grams(white, coverage), strict=True):
+        torch.testing.assert_close(a, b)
+
+
+def test_a_layer_whose_target_is_empty_does_not_count(encoder):
+    images = torch.rand(1, 64, 64, 1)
+    dot = torch.zeros(1, 64, 64)
+    dot[:, 20:44, 20:44] = 1  # no cell of conv5_1 is wholly inside
+    loss = StyleLoss(LossConfig(block_weights=[0, 0, 0, 0, 1]), encoder)
+    target, source = loss.grams(images, dot), loss.grams(images * 0.5)
+    assert target[4].abs().sum() == 0
+    assert loss.distance(source, target, loss.scales(target, source)) == 0

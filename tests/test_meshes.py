@@ -1,0 +1,742 @@
+"""Real files in, real files out: what must survive, and one sentence for what cannot."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import io
+import json
+import os
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from styleexp import meshes
+from styleexp.errors import UserError
+
+CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
+# Outward quads over CUBE.
+QUADS = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+
+
+def triangles(quads=QUADS):
+    return np.array([t for a, b, c, d in quads for t in ([a, b, c], [a, c, d])])
+
+
+def volume(vertices, faces):
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return np.einsum("ij,ij->", a, np.cross(b, c)) / 6
+
+
+def png(color) -> bytes:
+    out = io.BytesIO()
+    Image.new("RGB", (4, 4), color).save(out, "PNG")
+    return out.getvalue()
+
+
+def obj_text(vertices, faces) -> str:
+    lines = [f"v {x} {y} {z}" for x, y, z in vertices]
+    return "\n".join(lines + ["f " + " ".join(str(i + 1) for i in f) for f in faces]) + "\n"
+
+
+def same_surface(a, b, atol=1e-6):
+    np.testing.assert_allclose(a.vertices[a.faces], b.vertices[b.faces], atol=atol)
+
+
+@pytest.fixture
+def textured(tmp_path) -> Path:
+    """A cube with quads, three parts, interleaved materials, two textures and uv seams."""
+    (tmp_path / "wood grain.png").write_bytes(png("brown"))
+    (tmp_path / "bump.png").write_bytes(png("grey"))
+    (tmp_path / "cube.mtl").write_text(
+        "newmtl wood\nKd 1 1 1\nKs 0.5 0.5 0.5\nNs 17\nmap_Kd -s 1 1 1 wood grain.png\n"
+        "map_Bump -bm 0.5 bump.png\n\nnewmtl red paint\nKd 1 0 0\nd 0.5\n"
+    )
+    lines = ["mtllib cube.mtl", *(f"v {x} {y} {z}" for x, y, z in CUBE + 5)]
+    lines += ["vt 0 0", "vt 1 0", "vt 1 1", "vt 0 0.25"]
+    for k, quad in enumerate(QUADS):
+        if k % 2 == 0:
+            lines.append(f"o part {k // 2}")
+        lines.append(f"usemtl {('wood', 'red paint')[k % 2]}")
+        lines.append("f " + " ".join(f"{v + 1}/{t + 1}" for t, v in enumerate(quad)))
+    path = tmp_path / "cube.obj"
+    path.write_text("\n".join(lines))
+    return path
+
+
+def corner_uv(mesh):
+    return mesh.carrier.uv[mesh.carrier.corners]
+
+
+def material_names(mesh):
+    return [mesh.carrier.materials[k].name for k in mesh.carrier.face_material]
+
+
+def part_names(mesh):
+    return [mesh.carrier.parts[k] for k in mesh.carrier.face_part]
+
+
+# ------------------------------------------------------------------------------------------- basics
+
+
+def test_import_is_cheap():
+    code = (
+        "import sys, styleexp.meshes;"
+        "assert not {'torch', 'trimesh', 'scipy', 'gpytoolbox'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_normalisation_and_back():
+    rng = np.random.default_rng(0)
+    vertices = rng.normal(size=(50, 3)) * 3 + 100
+    frame = meshes.normalisation(vertices)
+    unit = frame.apply(vertices)
+    np.testing.assert_allclose(unit.mean(axis=0), 0, atol=1e-12)
+    assert np.linalg.norm(unit, axis=1).max() == pytest.approx(1)
+    np.testing.assert_allclose(frame.invert(unit), vertices)
+    with pytest.raises(UserError, match="no extent"):
+        meshes.normalisation(np.ones((4, 3)))
+
+
+def test_vertex_normals_are_area_weighted_and_always_finite():
+    # A flat square of unequal triangles, one without area, and a vertex that no face uses.
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [5, 5, 5]], dtype=float)
+    faces = np.array([[0, 1, 2], [0, 2, 3], [0, 0, 1]])
+    normals = meshes.vertex_normals(vertices, faces)
+    np.testing.assert_allclose(normals[:4], [[0, 0, 1]] * 4)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
+    np.testing.assert_allclose(meshes.face_areas(vertices, faces), [0.5, 0.5, 0])
+    for scale in (1e-30, 1e30):
+        np.testing.assert_allclose(meshes.vertex_normals(vertices * scale, faces), normals)
+    assert meshes.mean_edge_length(vertices, faces[:2]) == pytest.approx((4 + np.sqrt(2)) / 5)
+
+
+# ------------------------------------------------------------------------------------------ formats
+
+
+@pytest.mark.parametrize("extension", ["obj", "ply", "stl", "off", "glb", "gltf"])
+def test_reads_what_trimesh_writes(tmp_path, extension):
+    shape = trimesh.creation.icosphere(subdivisions=2)
+    path = tmp_path / f"ein Kügelchen 球.{extension}"
+    shape.export(path)
+    mesh = meshes.load_mesh(path)
+    assert mesh.name == "ein Kügelchen 球"
+    assert mesh.vertices.dtype == np.float64
+    assert mesh.faces.dtype == np.int64
+    assert len(mesh.vertices) == len(shape.vertices)
+    np.testing.assert_allclose(mesh.vertices[mesh.faces], shape.vertices[shape.faces], atol=1e-6)
+    assert mesh.repairs == ()
+
+
+@pytest.mark.parametrize("extension", ["ply", "obj", "glb"])
+def test_trimesh_reads_what_is_written(tmp_path, extension):
+    shape = trimesh.creation.icosphere(subdivisions=2)
+    mesh = meshes.Mesh("ball", np.array(shape.vertices), np.array(shape.faces, dtype=np.int64))
+    path = tmp_path / "new folder" / f"out.{extension}"
+    meshes.save_mesh(mesh, mesh.vertices * 2, path)
+    back = trimesh.load(path, process=False, force="mesh")
+    np.testing.assert_allclose(back.vertices[back.faces], 2 * mesh.vertices[mesh.faces], atol=1e-6)
+    assert os.listdir(path.parent) == [path.name]  # no temporary file is left
+
+
+@pytest.mark.parametrize("ending", ["\n", "\r\n", "\r"])
+def test_obj_line_ends_relative_indices_and_polygons(tmp_path, ending):
+    star = [
+        (np.cos(a) * r, np.sin(a) * r, 0)
+        for a, r in zip(np.arange(10) * np.pi / 5, [2, 0.5] * 5, strict=True)
+    ]
+    lines = ["# comment", *(f"v {x} {y} {z}" for x, y, z in CUBE), "f -8 -7 -5 -6", "f 5 7 8 \\"]
+    lines += [
+        "6",
+        *(f"v {x} {y} {z + 3}" for x, y, z in star),
+        "f " + " ".join(map(str, range(-10, 0))),
+    ]
+    lines += ["f 1 3 5 # a triangle after the others", "f 1 2"]
+    path = tmp_path / "a.obj"
+    path.write_bytes(ending.join(lines).encode())
+    mesh = meshes.load_mesh(path)
+    assert len(mesh.faces) == 2 + 2 + 8 + 1
+    assert "triangulated 2 quads" in mesh.repairs
+    assert "triangulated 1 polygon of more than four corners" in mesh.repairs
+    assert "left out 1 face with fewer than three corners" in mesh.repairs
+    np.testing.assert_allclose(mesh.vertices[mesh.faces[0]], CUBE[[0, 1, 3]])
+    np.testing.assert_allclose(mesh.vertices[mesh.faces[-1]], CUBE[[0, 2, 4]])
+    # The star is not convex: its triangles must cover its own area only, all facing +z.
+    star_faces = mesh.faces[4:12]
+    crosses = meshes._face_crosses(mesh.vertices, star_faces)
+    assert (crosses[:, 2] > 0).all()
+    x, y, _ = np.array(star).T
+    area = 0.5 * abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1)))
+    assert meshes.face_areas(mesh.vertices, star_faces).sum() == pytest.approx(area)
+
+
+@pytest.mark.parametrize("plane", range(3))
+@pytest.mark.parametrize("direction", [1, -1])
+def test_concave_polygons_in_any_plane(plane, direction):
+    flat = np.array([[0, 0], [4, 0], [4, 4], [2, 1], [0, 4]], dtype=float)[::direction]
+    points = np.insert(np.roll(flat, plane, axis=0), plane, 7.0, axis=1)
+    faces, _ = meshes._triangulate(np.array([5]), points)
+    crosses = meshes._face_crosses(points, faces)[:, plane]
+    assert (np.sign(crosses) == np.sign(crosses[0])).all()
+    assert np.abs(crosses).sum() / 2 == pytest.approx(10)
+
+
+def test_concave_quad_is_cut_inside():
+    points = np.array([[0, 0, 0], [2, -1, 0], [0.5, 0, 0], [2, 1, 0]], dtype=float)
+    for turn in range(4):
+        faces, _ = meshes._triangulate(np.array([4]), np.roll(points, turn, axis=0))
+        assert (meshes._face_crosses(np.roll(points, turn, axis=0), faces)[:, 2] > 0).all()
+
+
+def ply(kind: str) -> bytes:
+    """A square of two triangles and a quad in between, mixed, with colours."""
+    vertices = [(0, 0, 0), (1, 0, 0), (2, 0, 0), (2, 1, 0), (1, 1, 0), (0, 1, 0), (3, 0, 0)]
+    faces = [(0, 1, 5), (1, 2, 3, 4), (1, 4, 5), (2, 6, 3)]
+    head = (
+        f"ply\nformat {kind} 1.0\ncomment made by hand\nelement vertex 7\nproperty float x\n"
+        "property double y\nproperty float z\nproperty uchar red\nproperty uchar green\n"
+        "property uchar blue\nelement face 4\nproperty uchar flag\n"
+        "property list uchar int vertex_indices\nend_header\n"
+    ).encode()
+    if kind == "ascii":
+        body = "".join(f"{x} {y} {z} {10 * k} 0 255\n" for k, (x, y, z) in enumerate(vertices))
+        body += "".join(f"1 {len(f)} {' '.join(map(str, f))}\n" for f in faces)
+        return head + body.encode()
+    order = "<" if "little" in kind else ">"
+    body = b"".join(
+        struct.pack(f"{order}fdfBBB", x, y, z, 10 * k, 0, 255)
+        for k, (x, y, z) in enumerate(vertices)
+    )
+    return head + body + b"".join(struct.pack(f"{order}BB{len(f)}i", 1, len(f), *f) for f in faces)
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_ply_of_mixed_polygons_keeps_order_and_colours(tmp_path, kind):
+    path = tmp_path / "a.ply"
+    path.write_bytes(ply(kind))
+    mesh = meshes.load_mesh(path)
+    assert mesh.faces.tolist() == [[0, 1, 5], [1, 2, 3], [1, 3, 4], [1, 4, 5], [2, 6, 3]]
+    red = mesh.carrier.colors[mesh.carrier.corners][..., 0] * 255
+    np.testing.assert_allclose(red, 10 * mesh.faces)
+    for extension in ("ply", "obj", "glb"):
+        out = tmp_path / f"out.{extension}"
+        meshes.save_mesh(mesh, mesh.vertices + 1, out, displacement=np.arange(7.0))
+        back = meshes.load_mesh(out)
+        assert back.faces.tolist() == mesh.faces.tolist()
+        again = back.carrier.colors[back.carrier.corners][..., 0] * 255
+        np.testing.assert_allclose(again, red, atol=1e-3)
+    raw = trimesh.load(tmp_path / "out.ply", process=False).metadata["_ply_raw"]["vertex"]["data"]
+    np.testing.assert_allclose(raw["displacement"], np.arange(7))
+
+
+def test_off_of_mixed_polygons_with_comments(tmp_path):
+    path = tmp_path / "a.off"
+    lines = [f"{x} {y} {z}" for x, y, z in CUBE]
+    path.write_text(
+        "OFF # cube\n\n8 3 0\n" + "\n".join(lines) + "\n4 0 1 3 2\n3 4 6 7\n4 0 4 5 1 255 0 0\n"
+    )
+    mesh = meshes.load_mesh(path)
+    np.testing.assert_allclose(
+        mesh.vertices[mesh.faces], CUBE[[[0, 1, 3], [0, 3, 2], [4, 6, 7], [0, 4, 5], [0, 5, 1]]]
+    )
+
+
+# -------------------------------------------------------------------------------- seams, materials
+
+
+def test_obj_to_obj_keeps_everything(textured, tmp_path):
+    mesh = meshes.load_mesh(textured)
+    assert len(mesh.vertices) == 8  # welded across the seams
+    np.testing.assert_allclose(mesh.vertices[mesh.faces], (CUBE + 5)[triangles()])
+    out = tmp_path / "results" / "my cube.obj"
+    meshes.save_mesh(mesh, mesh.vertices * 2, out)
+    back = meshes.load_mesh(out)
+    np.testing.assert_array_equal(back.faces, mesh.faces)
+    np.testing.assert_allclose(back.vertices, mesh.vertices * 2)
+    np.testing.assert_allclose(corner_uv(back), corner_uv(mesh))
+    assert material_names(back) == ["wood"] * 2 + ["red paint"] * 2 + material_names(back)[4:]
+    assert material_names(back) == material_names(mesh)  # interleaved, in order
+    assert part_names(back) == part_names(mesh)
+    assert {p.name for p in out.parent.iterdir()} == {
+        "my cube.obj", "my cube.mtl", "my cube_wood grain.png", "my cube_bump.png",
+    }  # fmt: skip
+    mtl = (out.parent / "my cube.mtl").read_text()
+    assert "map_Kd -s 1 1 1 my cube_wood grain.png" in mtl
+    assert "map_Bump -bm 0.5 my cube_bump.png" in mtl
+    assert "Ns 17" in mtl
+    copied = (out.parent / "my cube_wood grain.png").read_bytes()
+    assert copied == (textured.parent / "wood grain.png").read_bytes()
+
+
+def test_saving_beside_the_input_leaves_its_files_alone(textured):
+    before = {p: p.read_bytes() for p in textured.parent.iterdir()}
+    mesh = meshes.load_mesh(textured)
+    for name in ("cube_styled.obj", "cube_styled.ply", "cube_styled.glb"):
+        meshes.save_mesh(mesh, mesh.vertices + 1, textured.with_name(name))
+    assert all(path.read_bytes() == content for path, content in before.items())
+
+
+def test_obj_to_glb_keeps_uv_textures_materials_names(textured, tmp_path):
+    mesh = meshes.load_mesh(textured)
+    out = tmp_path / "out.glb"
+    meshes.save_mesh(mesh, mesh.vertices + 1, out)
+    back = meshes.load_mesh(out)
+
+    # glTF cannot interleave materials, so faces are grouped within each part: compare as sets.
+    def key(m, shift):
+        return sorted(
+            (part, material, np.round(tri - shift, 5).tolist(), np.round(uv, 5).tolist())
+            for part, material, tri, uv in zip(
+                part_names(m), material_names(m), m.vertices[m.faces], corner_uv(m), strict=True
+            )
+        )
+
+    assert key(back, 1) == key(mesh, 0)
+    wood = next(m for m in back.carrier.materials if m.name == "wood")
+    assert back.carrier.textures[wood.texture] == (textured.parent / "wood grain.png").read_bytes()
+    red = next(m for m in back.carrier.materials if m.name == "red paint")
+    assert red.color == (1.0, 0.0, 0.0, 0.5)
+    scene = trimesh.load(out)  # and another reader agrees
+    assert {"part 0", "part 1", "part 2"} <= set(scene.graph.nodes)
+
+
+def test_ply_carries_uv_and_a_single_texture(tmp_path):
+    (tmp_path / "t.png").write_bytes(png("blue"))
+    (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd t.png\n")
+    corners = ["f 1/1 2/2 3/3", "f 1/3 3/2 4/1"]
+    vertices = ["v 0 0 0", "v 1 0 0", "v 1 1 0", "v 0 1 0"]
+    (tmp_path / "a.obj").write_text(
+        "\n".join(["mtllib a.mtl", *vertices, "vt 0 0", "vt 1 0", "vt 1 1", "usemtl m", *corners])
+    )
+    mesh = meshes.load_mesh(tmp_path / "a.obj")
+    meshes.save_mesh(mesh, mesh.vertices, tmp_path / "b.ply", displacement=np.zeros(4))
+    back = meshes.load_mesh(tmp_path / "b.ply")
+    same_surface(back, mesh)
+    assert len(back.vertices) == 4
+    np.testing.assert_allclose(corner_uv(back), corner_uv(mesh))
+    assert list(back.carrier.textures) == ["b_t.png"]
+    loaded = trimesh.load(tmp_path / "b.ply", process=False)
+    assert loaded.visual.material.image is not None
+
+
+def test_missing_material_files_are_reported_not_fatal(tmp_path):
+    path = tmp_path / "a.obj"
+    path.write_text("mtllib gone.mtl\nusemtl m\n" + obj_text(CUBE, QUADS))
+    assert any("gone.mtl" in note for note in meshes.load_mesh(path).repairs)
+    (tmp_path / "gone.mtl").write_text("newmtl m\nmap_Kd C:\\art\\gone.png\n")
+    assert any("gone.png" in note for note in meshes.load_mesh(path).repairs)
+    (tmp_path / "gone.png").write_bytes(png("red"))  # found by its bare name
+    assert meshes.load_mesh(path).repairs == ("triangulated 6 quads",)
+
+
+def test_hard_edges_and_smooth_ones_survive(tmp_path):
+    shape = trimesh.creation.box()
+    path = tmp_path / "box.obj"
+    normals = shape.face_normals
+    lines = [f"v {x} {y} {z}" for x, y, z in shape.vertices]
+    lines += [f"vn {x} {y} {z}" for x, y, z in normals]
+    lines += [f"f {a + 1}//{k + 1} {b + 1}//{k + 1} {c + 1}//{k + 1}"
+              for k, (a, b, c) in enumerate(shape.faces)]  # fmt: skip
+    path.write_text("\n".join(lines))
+    mesh = meshes.load_mesh(path)
+    meshes.save_mesh(mesh, mesh.vertices * [1, 2, 3], tmp_path / "out.glb")
+    back = meshes.load_mesh(tmp_path / "out.glb")
+    got = back.carrier.normals[back.carrier.corners]
+    np.testing.assert_allclose(got, np.repeat(normals[:, None], 3, axis=1), atol=1e-6)
+
+    # A dense ball written with a normal for each face, on the other hand, comes out smooth.
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    mesh = meshes.load_mesh(_flat_obj(tmp_path / "ball.obj", ball))
+    meshes.save_mesh(mesh, mesh.vertices, tmp_path / "ball.glb")
+    assert len(meshes.load_mesh(tmp_path / "ball.glb").carrier.rows) == len(ball.vertices)
+
+
+def _flat_obj(path, shape):
+    lines = [f"v {x} {y} {z}" for x, y, z in shape.vertices]
+    lines += [f"vn {x} {y} {z}" for x, y, z in shape.face_normals]
+    for k, (a, b, c) in enumerate(shape.faces + 1):
+        lines.append(f"f {a}//{k + 1} {b}//{k + 1} {c}//{k + 1}")
+    path.write_text("\n".join(lines))
+    return path
+
+
+# --------------------------------------------------------------------------------------------- glTF
+
+
+@pytest.fixture
+def scene(tmp_path) -> Path:
+    """Two nodes show one ball, a third a textured cube, the last a mirrored one with colours."""
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    cube = trimesh.creation.box()
+    cube.unmerge_vertices()
+    uv = np.random.default_rng(0).random((len(cube.vertices), 2))
+    image = Image.open(io.BytesIO(png("green")))
+    material = trimesh.visual.material.PBRMaterial(
+        name="leaf", baseColorTexture=image, roughnessFactor=0.3, metallicFactor=0.7
+    )
+    cube.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    cone = trimesh.creation.cone(1, 2, sections=8)
+    cone.visual = trimesh.visual.ColorVisuals(
+        cone, vertex_colors=[[9, 99, 199, 255]] * len(cone.vertices)
+    )
+    result = trimesh.Scene()
+    move = trimesh.transformations.translation_matrix
+    turn = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3])
+    result.add_geometry(ball, node_name="left", geom_name="ball", transform=move([-3, 0, 0]))
+    result.graph.update("right", geometry="ball", matrix=move([3, 0, 0]) @ np.diag([2, 2, 2, 1]))
+    result.add_geometry(cube, node_name="box", geom_name="crate", transform=turn)
+    result.add_geometry(cone, node_name="hat", geom_name="cone",
+                        transform=move([0, 5, 0]) @ np.diag([-1, 1, 1, 1]))  # fmt: skip
+    path = tmp_path / "scene.glb"
+    result.export(path)
+    return path
+
+
+def test_glb_scene_is_joined_in_world_space_and_written_back(scene, tmp_path):
+    mesh = meshes.load_mesh(scene)
+    original = trimesh.load(scene)
+    assert set(mesh.carrier.parts) == {"left", "right", "box", "hat"}
+    assert sum("inside out" in note for note in mesh.repairs) == 0  # mirrored, not inverted
+    for node in mesh.carrier.parts:
+        faces = mesh.faces[np.array(part_names(mesh)) == node]
+        matrix, name = original.graph[node]
+        shape = original.geometry[name].copy().apply_transform(matrix)
+        assert volume(mesh.vertices, faces) == pytest.approx(abs(shape.volume), rel=1e-5)
+        low, high = shape.bounds
+        np.testing.assert_allclose(mesh.vertices[faces].reshape(-1, 3).min(axis=0), low, atol=1e-5)
+        np.testing.assert_allclose(mesh.vertices[faces].reshape(-1, 3).max(axis=0), high, atol=1e-5)
+
+    moved = mesh.vertices + 0.05 * np.sin(7 * mesh.vertices[:, ::-1])
+    out = tmp_path / "out.glb"
+    meshes.save_mesh(mesh, moved, out)
+    back = meshes.load_mesh(out)
+    np.testing.assert_array_equal(back.faces, mesh.faces)
+    np.testing.assert_allclose(back.vertices, moved, atol=2e-6)
+    np.testing.assert_allclose(corner_uv(back), corner_uv(mesh), equal_nan=True)
+    assert part_names(back) == part_names(mesh)
+
+    again = trimesh.load(out)
+    assert {"left", "right", "box", "hat"} <= set(again.graph.nodes)
+    _, crate = again.graph["box"]
+    material = again.geometry[crate].visual.material
+    assert (material.name, material.roughnessFactor, material.metallicFactor) == ("leaf", 0.3, 0.7)
+    assert np.array(material.baseColorTexture)[0, 0, :3].tolist() == [0, 128, 0]
+    _, cone = again.graph["hat"]
+    assert again.geometry[cone].visual.vertex_colors[0].tolist() == [9, 99, 199, 255]
+    # Transforms stay where they were: a node's mesh lies in its own frame.
+    np.testing.assert_allclose(again.graph["box"][0], original.graph["box"][0], atol=1e-9)
+
+
+@pytest.mark.parametrize("extension", ["obj", "ply"])
+def test_glb_scene_as_other_formats(scene, tmp_path, extension):
+    mesh = meshes.load_mesh(scene)
+    out = tmp_path / f"out.{extension}"
+    meshes.save_mesh(mesh, mesh.vertices, out)
+    back = meshes.load_mesh(out)
+    same_surface(back, mesh)
+    used = np.array(part_names(mesh)) == "box"
+    np.testing.assert_allclose(corner_uv(back)[used], corner_uv(mesh)[used], atol=1e-6)
+    if extension == "obj":
+        assert part_names(back) == part_names(mesh)
+        assert "leaf" in material_names(back)
+        assert len(back.carrier.textures) == 1
+
+
+def test_gltf_keeps_what_is_not_understood(tmp_path):
+    """Extensions, extras, animations and a data URI's buffer pass through; tangents go."""
+    points = CUBE.astype("<f4")
+    index = triangles().astype("<u2")
+    spare = np.zeros((8, 4), "<f4")
+    blob = points.tobytes() + index.tobytes() + spare.tobytes()
+    uri = "data:application/octet-stream;base64," + base64.b64encode(blob).decode()
+    document = {
+        "asset": {"version": "2.0", "copyright": "me"},
+        "extensionsUsed": ["XYZ_unknown"],
+        "extensions": {"XYZ_unknown": {"a": 1}},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": "n", "mesh": 0, "rotation": [0, 0.6, 0, 0.8], "extras": {"b": 2}}],
+        "meshes": [{"name": "m", "primitives": [{"attributes": {"POSITION": 0, "TANGENT": 2},
+                                                 "indices": 1}]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 8, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5123, "count": 36, "type": "SCALAR"},
+            {"bufferView": 2, "componentType": 5126, "count": 8, "type": "VEC4"},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": 96},
+            {"buffer": 0, "byteOffset": 96, "byteLength": 72},
+            {"buffer": 0, "byteOffset": 168, "byteLength": 128},
+        ],
+        "buffers": [{"byteLength": len(blob), "uri": uri}],
+    }  # fmt: skip
+    path = tmp_path / "a.gltf"
+    path.write_text(json.dumps(document))
+    mesh = meshes.load_mesh(path)
+    np.testing.assert_array_equal(mesh.faces, triangles()[:, :])
+    meshes.save_mesh(mesh, mesh.vertices * 1.5, tmp_path / "b.glb")
+    again, _ = meshes._split_glb((tmp_path / "b.glb").read_bytes())
+    assert again["extensions"] == document["extensions"]
+    assert again["nodes"] == document["nodes"]
+    assert again["asset"]["copyright"] == "me"
+    assert set(again["meshes"][0]["primitives"][0]["attributes"]) == {"POSITION"}
+    np.testing.assert_allclose(
+        meshes.load_mesh(tmp_path / "b.glb").vertices, mesh.vertices * 1.5, atol=1e-6
+    )
+    meshes.save_mesh(mesh, mesh.vertices * 3, tmp_path / "c.glb")  # the carrier is not used up
+    assert meshes.load_mesh(tmp_path / "c.glb").vertices.max() == pytest.approx(
+        3 * mesh.vertices.max(), rel=1e-6
+    )
+
+
+# ---------------------------------------------------------------------------------------- repairs
+
+
+def write_obj(path, vertices, faces):
+    path.write_text(obj_text(vertices, faces))
+    return path
+
+
+def test_inward_mesh_is_turned_and_saved_as_it_came(tmp_path):
+    inward = triangles()[:, ::-1]
+    mesh = meshes.load_mesh(write_obj(tmp_path / "a.obj", CUBE, inward))
+    assert volume(mesh.vertices, mesh.faces) > 0
+    assert any("inside out" in note for note in mesh.repairs)
+    for extension in ("obj", "ply", "glb"):
+        out = tmp_path / f"b.{extension}"
+        meshes.save_mesh(mesh, mesh.vertices, out)
+        back = trimesh.load(out, process=False, force="mesh")
+        assert volume(back.vertices, back.faces) < 0
+
+
+def test_one_inward_part_and_a_cavity(tmp_path):
+    far = np.concatenate([CUBE, CUBE + 5, CUBE * 0.2 + 0.4])
+    faces = np.concatenate([triangles(), triangles()[:, ::-1] + 8, triangles()[:, ::-1] + 16])
+    mesh = meshes.load_mesh(write_obj(tmp_path / "a.obj", far, faces))
+    assert any("turned 1 part inside out" in note for note in mesh.repairs)
+    np.testing.assert_array_equal(mesh.carrier.flipped, np.arange(36) // 12 == 1)
+    assert volume(mesh.vertices, mesh.faces) == pytest.approx(2 - 0.2**3)
+
+
+def test_disagreeing_faces_are_turned(tmp_path):
+    faces = triangles()
+    faces[[2, 7, 8]] = faces[[2, 7, 8]][:, ::-1]
+    mesh = meshes.load_mesh(write_obj(tmp_path / "a.obj", CUBE, faces))
+    assert volume(mesh.vertices, mesh.faces) == pytest.approx(1)
+    np.testing.assert_array_equal(np.flatnonzero(mesh.carrier.flipped), [2, 7, 8])
+
+
+def test_open_non_manifold_and_one_sided_meshes_are_accepted(tmp_path):
+    fan = np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4]])  # three faces at one edge
+    mesh = meshes.load_mesh(write_obj(tmp_path / "fan.obj", CUBE[:5], fan))
+    np.testing.assert_array_equal(mesh.faces, fan)
+    n = 12
+    angle = np.arange(n) * 2 * np.pi / n
+    circle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
+    half = angle[:, None] / 2
+    side, middle = np.cos(half) * circle + np.sin(half) * [0, 0, 1], 3 * circle
+    points = np.concatenate([middle - side, middle + side])
+    quads = [[k, k + 1, n + k + 1, n + k] for k in range(n - 1)] + [[n - 1, n, 0, 2 * n - 1]]
+    band = meshes.load_mesh(write_obj(tmp_path / "band.obj", points, quads))
+    assert len(band.faces) == 2 * n
+    np.testing.assert_allclose(
+        np.linalg.norm(meshes.vertex_normals(band.vertices, band.faces), axis=1), 1
+    )
+
+
+def test_degenerate_faces_stay_and_duplicates_are_welded(tmp_path):
+    faces = np.concatenate([triangles(), [[0, 0, 1], [0, 8, 1]]])
+    points = np.concatenate([CUBE, CUBE[:1], [[9, 9, 9]]])
+    mesh = meshes.load_mesh(write_obj(tmp_path / "a.obj", points, faces))
+    assert len(mesh.faces) == 14
+    assert len(mesh.vertices) == 8
+    assert set(mesh.repairs) == {
+        "welded 1 duplicate vertex",
+        "left out 1 vertex that no face uses",
+        "ignored 2 degenerate faces for the normals",
+    }
+    assert np.isfinite(meshes.vertex_normals(mesh.vertices, mesh.faces)).all()
+
+
+@pytest.mark.parametrize("scale", [1e30, 1e-30, 1e7])
+def test_absurd_scales_work(tmp_path, scale):
+    path = write_obj(tmp_path / "a.obj", CUBE * scale, QUADS)
+    mesh = meshes.load_mesh(path)
+    frame = meshes.normalisation(mesh.vertices)
+    assert volume(frame.apply(mesh.vertices), mesh.faces) > 0.1
+    meshes.save_mesh(mesh, mesh.vertices, tmp_path / "b.ply")
+    np.testing.assert_allclose(
+        meshes.load_mesh(tmp_path / "b.ply").vertices, mesh.vertices, rtol=1e-6
+    )
+
+
+def test_far_from_the_origin_keeps_its_detail(tmp_path):
+    mesh = meshes.load_mesh(write_obj(tmp_path / "a.obj", CUBE + 4e6, QUADS))
+    moved = mesh.vertices + 0.01
+    for extension, atol in (("ply", 1e-9), ("obj", 1e-4)):
+        meshes.save_mesh(mesh, moved, tmp_path / f"b.{extension}")
+        back = meshes.load_mesh(tmp_path / f"b.{extension}")
+        np.testing.assert_allclose(back.vertices, moved, rtol=0, atol=atol)
+
+
+# ---------------------------------------------------------------------------------------- bad input
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+PLY_HEAD = (
+    "ply\nformat ascii 1.0\nelement vertex 3\n"
+    "property float x\nproperty float y\nproperty float z\n"
+    "element face {n}\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n"
+)
+GLTF_GONE = {
+    "asset": {"version": "2.0"},
+    "scenes": [{"nodes": [0]}],
+    "nodes": [{"mesh": 0}],
+    "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+    "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
+    "bufferViews": [{"buffer": 0, "byteLength": 36}],
+    "buffers": [{"byteLength": 36, "uri": "gone.bin"}],
+}
+JUNK = bytes(np.random.default_rng(3).integers(0, 256, 4000, dtype=np.uint8))
+
+BAD = {
+    "empty.obj": (b"", "is empty"),
+    "blank.ply": (b"  \n\n", "is empty"),
+    "points.obj": (TRIANGLE.encode(), "point cloud"),
+    "points.ply": (PLY_HEAD.format(n=0).encode(), "point cloud"),
+    "comment.obj": (b"# nothing here\n", "no mesh"),
+    "nan.obj": (b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "NaN or infinite"),
+    "inf.off": (b"OFF\n3 1 0\n0 0 inf\n1 0 0\n0 1 0\n3 0 1 2\n", "NaN or infinite"),
+    "beyond.obj": (TRIANGLE.encode() + b"f 1 2 9\n", "refers to vertex 8"),
+    "zero.obj": (TRIANGLE.encode() + b"f 0 1 2\n", "index 0"),
+    "before.obj": (TRIANGLE.encode() + b"f -4 1 2\n", "before the first"),
+    "negative.ply": (PLY_HEAD.format(n=1).encode() + b"3 0 1 -1\n", "negative"),
+    "beyond.off": (b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "refers to vertex 7"),
+    "line.obj": (b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "degenerate"),
+    "dot.obj": (b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "no extent"),
+    "two.obj": (TRIANGLE.encode() + b"f 1 2\n", "three corners"),
+    "flat.obj": (b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", "fewer than three coordinates"),
+    "words.obj": (b"v a b c\nf 1 1 1\n", "not a readable OBJ"),
+    "huge.obj": (b"v 0 0 0\nv 1e200 0 0\nv 0 1e200 0\nf 1 2 3\n", "scale the mesh down"),
+    "tiny.obj": (b"v 0 0 0\nv 1e-200 0 0\nv 0 1e-200 0\nf 1 2 3\n", "scale the mesh up"),
+    "unknown.xyz": (b"1 2 3\n", "supported mesh files are .obj"),
+    "noextension": (b"1 2 3\n", "no extension"),
+    "gone.gltf": (json.dumps(GLTF_GONE).encode(), "needs the buffer 'gone.bin'"),
+    "list.gltf": (b"[1, 2]", "not a glTF"),
+    "cut.glb": (struct.pack("<4sIII4s", b"glTF", 2, 999, 900, b"JSON") + b"{}", "ends too early"),
+    "cut.ply": (ply("binary_little_endian")[:-9], "cut.ply"),
+    "cut.off": (b"OFF\n3 1 0\n0 0 0\n", "ends too early"),
+    "header.ply": (b"ply\nformat ascii 1.0\n", "header is missing"),
+    **{f"junk{k}": (JUNK, "junk") for k in meshes.READABLE},
+    **{f"text{k}": (b"hello, world\n" * 20, "text") for k in meshes.READABLE},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_files_give_one_sentence(tmp_path, name):
+    content, message = BAD[name]
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(UserError) as caught:
+        meshes.load_mesh(path)
+    text = str(caught.value)
+    assert str(path) in text
+    assert message in text
+    assert "\n" not in text
+    assert text.endswith(".")
+    assert caught.value.__cause__ is None
+    assert caught.value.__context__ is None or caught.value.__suppress_context__
+
+
+def test_missing_file_folder_and_forbidden_file(tmp_path, monkeypatch):
+    with pytest.raises(UserError, match="does not exist"):
+        meshes.load_mesh(tmp_path / "nowhere.obj")
+    with pytest.raises(UserError, match="is a folder"):
+        meshes.load_mesh(tmp_path)
+
+    def forbidden(self):
+        raise PermissionError(13, "Permission denied")
+
+    # The superuser may read everything, so the system's refusal is played.
+    path = write_obj(tmp_path / "a.obj", CUBE, QUADS)
+    monkeypatch.setattr(Path, "read_bytes", forbidden)
+    with pytest.raises(UserError, match="may not be read"):
+        meshes.load_mesh(path)
+
+
+def test_every_truncation_of_a_good_file_is_either_read_or_explained(tmp_path, scene):
+    for source in (scene.read_bytes(), ply("binary_big_endian"), ply("ascii")):
+        path = tmp_path / ("cut.ply" if source.startswith(b"ply") else "cut.glb")
+        for length in range(1, len(source), max(1, len(source) // 60)):
+            path.write_bytes(source[:length])
+            # Whatever else it raises than this fails the test.
+            with contextlib.suppress(UserError):
+                meshes.load_mesh(path)
+
+
+def test_saving_says_what_is_wrong(tmp_path):
+    mesh = meshes.load_mesh(write_obj(tmp_path / "a.obj", CUBE, QUADS))
+    with pytest.raises(UserError, match=r"supported are \.ply, \.obj, \.glb"):
+        meshes.save_mesh(mesh, mesh.vertices, tmp_path / "b.stl")
+    with pytest.raises(UserError, match="diverged"):
+        meshes.save_mesh(mesh, mesh.vertices * np.nan, tmp_path / "b.ply")
+    with pytest.raises(ValueError, match="shape"):
+        meshes.save_mesh(mesh, mesh.vertices[:3], tmp_path / "b.ply")
+    with pytest.raises(UserError, match="cannot be written"):
+        meshes.save_mesh(mesh, mesh.vertices, tmp_path / "a.obj" / "b.ply")
+    with pytest.raises(UserError, match="save as PLY"):
+        meshes.save_mesh(mesh, mesh.vertices * 1e39, tmp_path / "b.glb")
+    assert not (tmp_path / "b.glb").exists()
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    mesh = meshes.load_mesh(write_obj(tmp_path / "a.obj", CUBE, QUADS))
+    out = tmp_path / "b.ply"
+    meshes.save_mesh(mesh, mesh.vertices, out)
+    before = out.read_bytes()
+
+    def full(self, data):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(UserError, match="No space left"):
+        meshes.save_mesh(mesh, mesh.vertices * 2, out)
+    monkeypatch.undo()
+    assert out.read_bytes() == before
+    assert {p.name for p in tmp_path.iterdir()} == {"a.obj", "b.ply"}
+
+
+# ---------------------------------------------------------------------------------------- remeshing
+
+
+def test_remesh_makes_it_dense_and_says_so(textured):
+    mesh = meshes.load_mesh(textured)
+    dense = meshes.remesh(mesh, 2000)
+    assert 1700 < len(dense.vertices) < 2300
+    assert any("remeshed evenly" in n and "are not kept" in n for n in dense.repairs)
+    assert dense.carrier is None
+    assert volume(dense.vertices, dense.faces) == pytest.approx(1, rel=1e-6)
+    assert dense.vertices.min() > 4.99  # in the input's frame
+    assert dense.vertices.max() < 6.01
+    assert meshes.remesh(dense, 100).faces is dense.faces
+    assert "not remeshed" in meshes.remesh(dense, 100).repairs[-1]
+
+
+def test_remesh_of_a_non_manifold_mesh_divides_it(tmp_path):
+    fan = [[0, 1, 2], [1, 0, 3], [0, 1, 4]]
+    mesh = meshes.load_mesh(write_obj(tmp_path / "fan.obj", CUBE[:5], fan))
+    dense = meshes.remesh(mesh, 300)
+    assert len(dense.vertices) >= 300
+    assert "not manifold" in dense.repairs[-1]
+    total = meshes.face_areas(dense.vertices, dense.faces).sum()
+    assert total == pytest.approx(meshes.face_areas(mesh.vertices, mesh.faces).sum())
+    bow_tie = np.concatenate([triangles(), triangles() + 8])
+    points = np.concatenate([CUBE, CUBE + 1])  # two cubes share a corner
+    mesh = meshes.load_mesh(write_obj(tmp_path / "tie.obj", points, bow_tie))
+    assert "a vertex joins several sheets" in meshes.remesh(mesh, 300).repairs[-1]

@@ -1,0 +1,115 @@
+"""The whole pipeline on small shapes, with random weights where the style doesn't matter."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+import styleexp
+from styleexp.compose import compose
+from styleexp.errors import UserError
+from styleexp.stylize import choose_device, finish, optimise, prepare, start
+
+SMOKE = ("profile=smoke", "encoder=vgg19_random")
+pytestmark = pytest.mark.filterwarnings("ignore:the encoder 'vgg19_random'")
+
+
+def run(*overrides):
+    scene = prepare(compose([*SMOKE, *overrides]))
+    state = start(scene)
+    steps = list(optimise(scene, state))
+    return finish(scene, state), steps
+
+
+def test_robust_and_paper_run_and_displace_along_the_normals():
+    for method in ("robust", "paper"):
+        result, steps = run("source=sphere", "style=stripe", f"method={method}")
+        assert [s.step for s in steps] == [1, 2, 3, 4]
+        assert np.isfinite(result.vertices).all()
+        moved = result.vertices - result.scene.source.vertices
+        assert np.abs(result.displacement).max() > 0
+        normals = result.scene.normals.numpy()
+        np.testing.assert_allclose(moved, result.displacement[:, None] * normals, atol=1e-6)
+        assert np.abs(result.displacement).max() <= 0.1 * result.scene.frame.scale
+
+
+def test_same_seed_gives_the_same_mesh_and_another_seed_another():
+    one, two = run("source=torus", "style=bubble")[0], run("source=torus", "style=bubble")[0]
+    assert np.array_equal(one.vertices, two.vertices)
+    other = run("source=torus", "style=bubble", "optim.seed=1")[0]
+    assert not np.array_equal(one.vertices, other.vertices)
+
+
+def test_strength_zero_gives_the_source_back_exactly():
+    result, _ = run("source=torus", "style=bubble", "strength=0")
+    assert np.array_equal(result.vertices, result.scene.source.vertices)
+
+
+def test_result_is_in_the_sources_own_frame(tmp_path):
+    """A scaled and shifted source must give the same result, scaled and shifted."""
+    mesh = styleexp.load_mesh(save_torus(tmp_path / "near.ply", 1.0, 0.0))
+    save_torus(tmp_path / "far.ply", 40.0, 7.0)
+    near = run(f"source.path={tmp_path}/near.ply", "style=wave_large")[0]
+    far = run(f"source.path={tmp_path}/far.ply", "style=wave_large")[0]
+    np.testing.assert_allclose(far.displacement, 40 * near.displacement, atol=40 * 2e-3)
+    np.testing.assert_allclose(
+        far.vertices - far.displacement[:, None] * far.scene.normals.numpy(),
+        mesh.vertices * 40 + 7,
+        atol=1e-3,
+    )
+
+
+def save_torus(path, scale, shift):
+    from styleexp import meshes, shapes
+
+    torus = shapes.make("torus", detail=2000)
+    meshes.save_mesh(torus, torus.vertices * scale + shift, path)
+    return path
+
+
+def test_optimisation_reaches_for_the_style():
+    """With enough steps on a small scene, the distance to the style falls by half."""
+    _, steps = run("source=sphere", "style=wave_large", "optim.steps=30", "optim.rate=2e-3")
+    first, last = [np.mean([s.loss for s in part]) for part in (steps[:3], steps[-3:])]
+    assert last < 0.5 * first
+
+
+def test_image_style_runs_and_contrast_sets_the_relief(tmp_path):
+    from PIL import Image
+
+    rows = (np.sin(np.arange(128) / 3) * 100 + 128).astype(np.uint8)
+    Image.fromarray(np.repeat(rows[:, None], 128, axis=1)).save(tmp_path / "rows.png")
+    for method in ("robust", "paper"):
+        result, _ = run("source=sphere", f"style.path={tmp_path}/rows.png", f"method={method}")
+        assert np.abs(result.displacement).max() > 0
+
+
+@pytest.mark.parametrize("mode", ["image", "zoom", "surface"])
+def test_every_kind_of_local_view_runs(mode):
+    result, _ = run("source=torus", "style=rail", f"views.local.mode={mode}")
+    assert np.abs(result.displacement).max() > 0
+
+
+def test_python_call_equals_the_command_line(tmp_path):
+    result = styleexp.stylize("torus", "bubble", *SMOKE)
+    expected, _ = run("source=torus", "style=bubble")
+    assert np.array_equal(result.vertices, expected.vertices)
+    result.save(tmp_path / "out.glb")
+    assert (tmp_path / "out.glb").stat().st_size > 1000
+
+
+def test_a_loss_that_explodes_is_reported_with_its_step():
+    scene = prepare(compose([*SMOKE, "source=torus", "style=bubble"]))
+    broken = dataclasses.replace(
+        scene, scales=([torch.tensor(0.0)] * 5, [torch.tensor(0.0)] * 5)
+    )
+    with pytest.raises(UserError, match="at step 0"):
+        list(optimise(broken, start(broken)))
+
+
+def test_a_missing_device_is_an_error_not_a_fallback():
+    if torch.cuda.is_available():
+        pytest.skip("there is a CUDA device, so asking for one is no error")
+    with pytest.raises(UserError, match="device=cpu"):
+        choose_device("cuda")
