@@ -71,7 +71,8 @@ def test_ply_carries_the_displacement(finished):
 
 def test_kill_and_resume_is_bit_identical(finished, tmp_path):
     folder = tmp_path / "killed"
-    arguments = ["source=torus", "style=bubble", *SMOKE, "optim.steps=30", f"hydra.run.dir={folder}"]
+    arguments = ["source=torus", "style=bubble", *SMOKE, "optim.steps=30"]
+    arguments.append(f"hydra.run.dir={folder}")
     undisturbed = tmp_path / "whole"
     assert command(*arguments[:-1], f"hydra.run.dir={undisturbed}", cwd=tmp_path).returncode == 0
     process = subprocess.Popen([sys.executable, "-m", "styleexp", *arguments], cwd=tmp_path)
@@ -167,7 +168,8 @@ def test_mistakes_get_one_sentence(arguments, expected, tmp_path):
 
 def test_failure_is_recorded_with_its_reason(tmp_path):
     (tmp_path / "empty.obj").touch()
-    done = command("source.path=empty.obj", "style=bubble", *SMOKE, "hydra.run.dir=run", cwd=tmp_path)
+    arguments = ["source.path=empty.obj", "style=bubble", *SMOKE, "hydra.run.dir=run"]
+    done = command(*arguments, cwd=tmp_path)
     assert "empty.obj" in complaint(done)
     status = json.loads((tmp_path / "run" / "status.json").read_text())
     assert status["status"] == "failed"
@@ -208,9 +210,8 @@ def test_works_from_an_empty_folder_with_relative_paths_and_odd_names(tmp_path):
 
     torus = shapes.make("torus", detail=800)
     meshes.save_mesh(torus, torus.vertices, tmp_path / "mein Käse=ring.ply")
-    done = command(
-        "source.path='mein Käse=ring.ply'", "style=bubble", *SMOKE, "hydra.run.dir=run", cwd=tmp_path
-    )
+    source = "source.path='mein Käse=ring.ply'"
+    done = command(source, "style=bubble", *SMOKE, "hydra.run.dir=run", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     result = styleexp.load_mesh(tmp_path / "run" / "result.glb")
     assert np.array_equal(result.faces, torus.faces)

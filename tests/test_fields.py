@@ -39,19 +39,19 @@ def test_starts_at_the_source_and_keeps_its_bound():
     field = DisplacementField(FieldConfig(bound=0.1), generator())
     encoded = field.encode(torch.rand(50, 3))
     assert (field(encoded) == 0).all()
-    torch.nn.init.constant_(field.layers[-1].bias, 1e3)
+    torch.nn.init.constant_(field.last.bias, 1e3)
     assert field(encoded).max().item() == pytest.approx(0.1)
 
 
 def test_paper_sizes():
     field = DisplacementField(FieldConfig(), generator())
-    shapes = [tuple(layer.weight.shape) for layer in field.layers]
+    shapes = [tuple(layer.weight.shape) for layer in (*field.hidden, field.last)]
     assert shapes == [(256, 256)] * 7 + [(1, 256)]
 
 
 def test_equal_generators_make_equal_fields_and_others_do_not():
     def weights(seed):
-        return DisplacementField(FieldConfig(), generator(seed)).layers[0].weight
+        return DisplacementField(FieldConfig(), generator(seed)).hidden[0].weight
 
     assert torch.equal(weights(1), weights(1))
     assert not torch.equal(weights(1), weights(2))

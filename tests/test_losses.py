@@ -4,6 +4,7 @@ import torch
 from styleexp.config import LossConfig
 from styleexp.encoders import load_encoder
 from styleexp.losses import StyleLoss, gram_matrix, layer_mask
+from styleexp.viewer import Images
 
 
 def test_gram_is_the_normalised_product_averaged_over_views():
@@ -38,6 +39,12 @@ def test_mask_keeps_whole_cells_and_erodes_from_holes_but_not_from_the_frame():
     assert eroded[0, 0, 7]
 
 
+def grams(loss, image, coverage=None):
+    """Grams of images, by default covered everywhere."""
+    coverage = torch.ones_like(image[..., 0]) if coverage is None else coverage
+    return loss.grams(Images(image, coverage))
+
+
 @pytest.fixture(scope="module")
 def encoder():
     with pytest.warns(UserWarning, match="random"):
@@ -53,7 +60,7 @@ def test_the_papers_layers_by_index_and_by_name_are_the_same(encoder):
 def test_distance_is_zero_at_the_target_and_weights_blocks(encoder):
     images = torch.rand(2, 64, 64, 1)
     loss = StyleLoss(LossConfig(relative="none", block_weights=[1, 0, 0, 0, 0]), encoder)
-    own, other = loss.grams(images), loss.grams(images.square())
+    own, other = grams(loss, images), grams(loss, images.square())
     scales = loss.scales(own, other)
     assert loss.distance(own, own, scales) == 0
     first_layer = (own[0] - other[0]).square().sum()
@@ -63,7 +70,7 @@ def test_distance_is_zero_at_the_target_and_weights_blocks(encoder):
 def test_relative_to_the_source_starts_every_layer_at_one(encoder):
     images = torch.rand(2, 64, 64, 1)
     loss = StyleLoss(LossConfig(relative="source", block_weights=[1] * 5), encoder)
-    target, source = loss.grams(images), loss.grams(1 - images * 0.5)
+    target, source = grams(loss, images), grams(loss, 1 - images * 0.5)
     scales = loss.scales(target, source)
     assert loss.distance(source, target, scales) == pytest.approx(5.0, rel=1e-4)
 
@@ -77,7 +84,7 @@ def test_background_does_not_matter_when_masked(encoder):
     white = images.clone()
     white[coverage == 0] = 1.0
     loss = StyleLoss(LossConfig(layers=["conv1_1", "conv2_1"], erosion=2), encoder)
-    for a, b in zip(loss.grams(images, coverage), loss.grams(white, coverage), strict=True):
+    for a, b in zip(grams(loss, images, coverage), grams(loss, white, coverage), strict=True):
         torch.testing.assert_close(a, b)
 
 
@@ -86,6 +93,6 @@ def test_a_layer_whose_target_is_empty_does_not_count(encoder):
     dot = torch.zeros(1, 64, 64)
     dot[:, 20:44, 20:44] = 1  # no cell of conv5_1 is wholly inside
     loss = StyleLoss(LossConfig(block_weights=[0, 0, 0, 0, 1]), encoder)
-    target, source = loss.grams(images, dot), loss.grams(images * 0.5)
+    target, source = grams(loss, images, dot), grams(loss, images * 0.5)
     assert target[4].abs().sum() == 0
     assert loss.distance(source, target, loss.scales(target, source)) == 0

@@ -25,7 +25,7 @@ from styleexp.renderers.soft_raster.geometry import (
     SumAtVertices,
     unit,
 )
-from styleexp.renderers.soft_raster.shading import PickOne, InterpolateAndLight
+from styleexp.renderers.soft_raster.shading import InterpolateAndLight, PickOne
 
 
 class HardRaster(SoftRaster):
@@ -46,14 +46,23 @@ def test_conformance(renderer: SoftRaster, check: testing.Check) -> None:
         pytest.skip(str(reason))
 
 
-def test_check_renderer_reports_all_failures() -> None:
+def test_check_renderer_reports_all_failures(monkeypatch: pytest.MonkeyPatch) -> None:
     class Upside(SoftRaster):
         def render(self, *arguments):  # type: ignore[no-untyped-def]
             out = super().render(*arguments)
             return replace(out, image=out.image.flip(1), face_ids=out.face_ids.flip(1))
 
-    with pytest.raises(AssertionError, match="orientation"):
+    some = (testing.orientation, testing.crop_is_part_of_whole, testing.triangle_area)
+    monkeypatch.setattr(testing, "CHECKS", some)
+    with pytest.raises(AssertionError, match="2 checks failed") as failure:
         testing.check_renderer(Upside())
+    assert "orientation" in str(failure.value)
+    assert "crop_is_part_of_whole" in str(failure.value)
+    assert testing.check_renderer(HardRaster()) == {
+        "orientation": "passed",
+        "crop_is_part_of_whole": "passed",
+        "triangle_area": "not applicable: does not differentiate visibility",
+    }
 
 
 def test_unknown_names_are_user_errors() -> None:

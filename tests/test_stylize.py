@@ -9,7 +9,8 @@ import torch
 import styleexp
 from styleexp.compose import compose
 from styleexp.errors import UserError
-from styleexp.stylize import choose_device, finish, optimise, prepare, start
+from styleexp.scene import choose_device, prepare
+from styleexp.stylize import finish, optimise, start
 
 SMOKE = ("profile=smoke", "encoder=vgg19_random")
 pytestmark = pytest.mark.filterwarnings("ignore:the encoder 'vgg19_random'")
@@ -29,7 +30,7 @@ def test_robust_and_paper_run_and_displace_along_the_normals():
         assert np.isfinite(result.vertices).all()
         moved = result.vertices - result.scene.source.vertices
         assert np.abs(result.displacement).max() > 0
-        normals = result.scene.normals.numpy()
+        normals = result.scene.surface.normals.numpy()
         np.testing.assert_allclose(moved, result.displacement[:, None] * normals, atol=1e-6)
         assert np.abs(result.displacement).max() <= 0.1 * result.scene.frame.scale
 
@@ -54,7 +55,7 @@ def test_result_is_in_the_sources_own_frame(tmp_path):
     far = run(f"source.path={tmp_path}/far.ply", "style=wave_large")[0]
     np.testing.assert_allclose(far.displacement, 40 * near.displacement, atol=40 * 2e-3)
     np.testing.assert_allclose(
-        far.vertices - far.displacement[:, None] * far.scene.normals.numpy(),
+        far.vertices - far.displacement[:, None] * far.scene.surface.normals.numpy(),
         mesh.vertices * 40 + 7,
         atol=1e-3,
     )
@@ -101,9 +102,7 @@ def test_python_call_equals_the_command_line(tmp_path):
 
 def test_a_loss_that_explodes_is_reported_with_its_step():
     scene = prepare(compose([*SMOKE, "source=torus", "style=bubble"]))
-    broken = dataclasses.replace(
-        scene, scales=([torch.tensor(0.0)] * 5, [torch.tensor(0.0)] * 5)
-    )
+    broken = dataclasses.replace(scene, scales=([torch.tensor(0.0)] * 5, [torch.tensor(0.0)] * 5))
     with pytest.raises(UserError, match="at step 0"):
         list(optimise(broken, start(broken)))
 

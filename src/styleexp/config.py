@@ -1,6 +1,6 @@
 """The configuration schema: every choice of an experiment, with its meaning.
 
-Hydra validates against these dataclasses. Defaults here are the ``robust`` method's; ``conf/method``
+Hydra validates against these dataclasses. The defaults are the ``robust`` method's; ``conf/method``
 holds the presets and ``conf/profile`` the sizes. Section and equation numbers are the paper's.
 This module imports nothing heavy: ``styleexp --help`` reads it.
 """
@@ -10,6 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from dataclasses import field as option
 from typing import Any
+
+from styleexp.errors import UserError, unknown_name
 
 
 @dataclass
@@ -21,7 +23,7 @@ class SourceConfig:
     path: str | None = None
     """A mesh file; wins over ``name``."""
     remesh: int | None = None
-    """Remesh to about this many vertices first (attributes are lost); null keeps the mesh as it is."""
+    """Remesh to about this many vertices first (attributes are lost); null keeps the mesh."""
 
 
 @dataclass
@@ -35,8 +37,8 @@ class StyleConfig:
     scale: float = 1.0
     """Size of the pattern on the result: 2 makes its features twice as large."""
     scale_by: str = "area"
-    """Mesh styles: what ``scale`` 1 means. ``area``: the result carries as many features as the style
-    mesh. ``frame``: both meshes fill the unit sphere, as in the paper."""
+    """Mesh styles: what ``scale`` 1 means. ``area``: the result carries as many features as the
+    style mesh. ``frame``: both meshes fill the unit sphere, as in the paper."""
     image_contrast: float | None = 0.12
     """Image styles: standard deviation that the picture's tone is brought to (it sets the height of
     the relief); null keeps the picture's own contrast."""
@@ -74,7 +76,8 @@ class LocalViewsConfig:
 
     mode: str = "surface"
     """``image``: crops of the rendered global view, as in the paper. ``zoom``: the same windows,
-    rendered anew by a zoomed camera. ``surface``: a zoomed camera aimed at a random surface point."""
+    rendered anew by a zoomed camera. ``surface``: a zoomed camera aimed at a random point of the
+    surface."""
     per_view: int = 4
     """Local views for each global view."""
     crop: str = "side"
@@ -121,9 +124,9 @@ class ShadingConfig:
     """``flat`` or ``smooth``."""
     background: str = "foreground"
     """``white``, ``black``, ``foreground`` (the mean grey of the rendered source) or a number."""
-    light: str = "fixed"
-    """``fixed`` in camera space, or ``random``: a direction of its own for every view, the same for
-    style and result."""
+    light_spread: float = 0.0
+    """Largest angle, in degrees, by which the light is turned at random about the viewing axis, for
+    every view anew; 0 fixes it in camera space. At 180 bumps can't be told from dents."""
 
 
 @dataclass
@@ -164,8 +167,6 @@ class LossConfig:
     """``bank``: the style's Grams are averaged once over a bank of views. ``same_views``: the style
     mesh is rendered at the result's views in every step, as in the paper."""
     bank_views: int = 24
-    smoothness: float = 0.0
-    """Weight of the displacement's squared Laplacian."""
 
 
 @dataclass
@@ -213,3 +214,93 @@ class Config:
     """CPU threads for torch; 0 takes all cores."""
     debug: bool = False
     """Show tracebacks of user errors."""
+
+
+CHOICES = {
+    "style.scale_by": ("area", "frame"),
+    "views.spread": ("normal", "around"),
+    "views.local.mode": ("image", "zoom", "surface"),
+    "views.local.crop": ("side", "area"),
+    "shading.normals": ("flat", "smooth"),
+    "encoder.precision": ("auto", "fp32", "bf16"),
+    "encoder.pooling": ("max", "avg"),
+    "encoder.normalisation": ("weights", "paper"),
+    "loss.relative": ("none", "target", "source"),
+    "loss.target": ("bank", "same_views"),
+}
+
+POSITIVE = (
+    "style.scale",
+    "style.image_tile",
+    "field.sigma",
+    "field.features",
+    "field.width",
+    "field.bound",
+    "views.count",
+    "views.distance",
+    "views.local.per_view",
+    "views.local.share",
+    "views.local.extent",
+    "loss.bank_views",
+    "optim.steps",
+    "optim.rate",
+    "optim.decay",
+    "optim.decay_every",
+    "optim.checkpoint_every",
+    "preview.turntable_frames",
+)
+
+BETWEEN = {
+    "source.remesh": (100, 10_000_000),
+    "style.image_contrast": (0.0, 0.5),
+    "field.depth": (2, 64),
+    "field.progressive": (0.0, 1.0),
+    "views.resolution": (32, 4096),
+    "views.fov": (1.0, 170.0),
+    "views.perspective": (0.0, 0.99),
+    "views.perspective_probability": (0.0, 1.0),
+    "views.local.size": (16, 2048),
+    "views.local.share": (0.0, 1.0),
+    "shading.albedo": (0.0, 1.0),
+    "shading.light_spread": (0.0, 180.0),
+    "loss.erosion": (0, 64),
+    "preview.resolution": (32, 4096),
+    "threads": (0, 4096),
+}
+
+
+def check(config: Config) -> None:
+    """Raise `UserError` for a value that has no meaning, naming its key and what is allowed."""
+    for key, allowed in CHOICES.items():
+        if _value(config, key) not in allowed:
+            raise unknown_name(f"value for {key}", str(_value(config, key)), allowed)
+    for key in POSITIVE:
+        if not _value(config, key) > 0:
+            raise UserError(f"{key}={_value(config, key)} is not allowed: give a value above 0.")
+    for key, (low, high) in BETWEEN.items():
+        value = _value(config, key)
+        if value is not None and not low <= value <= high:
+            raise UserError(f"{key}={value} is not allowed: give a value from {low} to {high}.")
+    if len(config.loss.block_weights) != 5 or min(config.loss.block_weights) < 0:
+        raise UserError(
+            f"loss.block_weights={config.loss.block_weights} is not allowed: give five weights, "
+            "one for each of VGG's blocks, none below 0."
+        )
+    background = config.shading.background
+    if background not in ("white", "black", "foreground"):
+        try:
+            grey = float(background)
+        except ValueError:
+            grey = -1.0
+        if not 0 <= grey <= 1:
+            raise UserError(
+                f"shading.background={background} is not allowed: give white, black, foreground or "
+                "a grey from 0 to 1."
+            )
+
+
+def _value(config: Config, key: str) -> Any:
+    value: Any = config
+    for part in key.split("."):
+        value = getattr(value, part)
+    return value

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import TYPE_CHECKING
 
@@ -58,13 +59,15 @@ class DisplacementField(nn.Module):
             config.features, config.sigma, config.include_input, generator
         )
         sizes = [self.encode.size] + [config.width] * (config.depth - 1) + [1]
-        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes, sizes[1:], strict=False))
-        for layer in self.layers:  # torch's default initialisation, from our own generator
+        linears = [nn.Linear(a, b) for a, b in itertools.pairwise(sizes)]
+        for layer in linears:  # torch's default initialisation, from our own generator
             span = 1 / math.sqrt(layer.in_features)
             nn.init.uniform_(layer.weight, -span, span, generator=generator)
             nn.init.uniform_(layer.bias, -span, span, generator=generator)
-        nn.init.zeros_(self.layers[-1].weight)
-        nn.init.zeros_(self.layers[-1].bias)
+        nn.init.zeros_(linears[-1].weight)
+        nn.init.zeros_(linears[-1].bias)
+        self.hidden = nn.ModuleList(linears[:-1])
+        self.last = linears[-1]
 
     def forward(
         self, encoded: Float[Tensor, "vertices size"], precision: torch.dtype = torch.float32
@@ -74,13 +77,12 @@ class DisplacementField(nn.Module):
         Hidden layers run in ``precision``; the last one always in float32, because neighbouring
         displacements differ by less than bfloat16 resolves.
         """
-        *hidden, last = self.layers
         x = encoded.to(precision)
-        for layer in hidden:
-            x = torch.relu(
-                nn.functional.linear(x, layer.weight.to(precision), layer.bias.to(precision))
-            )
-        return self.bound * torch.tanh(last(x.float()).squeeze(-1))
+        for layer in self.hidden:
+            assert isinstance(layer, nn.Linear)
+            weight, bias = layer.weight.to(precision), layer.bias.to(precision)
+            x = torch.relu(nn.functional.linear(x, weight, bias))
+        return self.bound * torch.tanh(self.last(x.float()).squeeze(-1))
 
 
 def zero_mean(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
@@ -11,32 +12,36 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-def vertex_areas(
-    vertices: Float[Tensor, "vertices 3"], faces: Int[Tensor, "faces 3"]
-) -> Float[Tensor, " vertices"]:
+@dataclass(frozen=True)
+class Surface:
+    """A triangle mesh as tensors on one device."""
+
+    vertices: Float[Tensor, "vertices 3"]
+    faces: Int[Tensor, "faces 3"]
+    normals: Float[Tensor, "vertices 3"]
+    """Unit, area-weighted."""
+
+
+def vertex_areas(surface: Surface) -> Float[Tensor, " vertices"]:
     """A third of the area of the faces around each vertex."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    a, b, c = (surface.vertices[surface.faces[:, i]] for i in range(3))
     areas = torch.linalg.cross(b - a, c - a).norm(dim=1) / 6
-    total = vertices.new_zeros(len(vertices))
-    return total.index_add(0, faces.reshape(-1), areas.repeat_interleave(3))
+    total = surface.vertices.new_zeros(len(surface.vertices))
+    return total.index_add(0, surface.faces.reshape(-1), areas.repeat_interleave(3))
 
 
 def sample_surface(
-    vertices: Float[Tensor, "vertices 3"],
-    faces: Int[Tensor, "faces 3"],
-    normals: Float[Tensor, "vertices 3"],
-    count: int,
-    generator: torch.Generator,
+    surface: Surface, count: int, generator: torch.Generator
 ) -> tuple[Float[Tensor, "count 3"], Float[Tensor, "count 3"]]:
     """Points spread evenly over the surface, with their interpolated unit normals."""
-    corners = vertices[faces]
+    corners = surface.vertices[surface.faces]
     areas = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     weights = areas.norm(dim=1).cpu().double()
     chosen = torch.multinomial(weights, count, replacement=True, generator=generator)
     u, v = torch.rand(2, count, generator=generator)
     flip = u + v > 1
     u, v = torch.where(flip, 1 - u, u), torch.where(flip, 1 - v, v)
-    mix = torch.stack([1 - u - v, u, v], dim=1).to(vertices)[:, :, None]
-    picked = faces[chosen.to(faces.device)]
-    normal = (normals[picked] * mix).sum(1)
-    return (vertices[picked] * mix).sum(1), torch.nn.functional.normalize(normal, dim=1)
+    mix = torch.stack([1 - u - v, u, v], dim=1).to(surface.vertices)[:, :, None]
+    picked = surface.faces[chosen.to(surface.faces.device)]
+    normal = (surface.normals[picked] * mix).sum(1)
+    return (surface.vertices[picked] * mix).sum(1), torch.nn.functional.normalize(normal, dim=1)

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
     from styleexp.config import LossConfig
     from styleexp.encoders import Encoder
+    from styleexp.viewer import Images
 
 Grams = list["Float[Tensor, 'channels channels']"]
 """One Gram matrix per style layer, averaged over views."""
@@ -31,7 +32,7 @@ def gram_matrix(
     views, channels, height, width = features.shape
     cells = features.permute(0, 2, 3, 1).reshape(views, height * width, channels)
     if mask is None:
-        count = views * height * width
+        count = cells.new_tensor(views * height * width, dtype=torch.float32)
     else:
         keep = mask.reshape(views, height * width, 1)
         cells = cells * keep.to(cells.dtype)
@@ -61,19 +62,15 @@ class StyleLoss:
         self.layers = encoder.resolve(config.layers)
         self.weights = [config.block_weights[int(name[4]) - 1] for name in self.layers]
 
-    def grams(
-        self,
-        images: Float[Tensor, "views height width channels"],
-        coverage: Float[Tensor, "views height width"] | None = None,
-    ) -> Grams:
-        """One Gram per style layer; ``coverage`` limits them to the foreground if so configured."""
-        features = self.encoder(images.permute(0, 3, 1, 2), self.layers)
+    def grams(self, seen: Images) -> Grams:
+        """One Gram per style layer, over the foreground alone if so configured."""
+        features = self.encoder(seen.image.permute(0, 3, 1, 2), self.layers)
         grams = []
         for layer in self.layers:
             mask = None
-            if self.config.masked and coverage is not None:
+            if self.config.masked:
                 height, width = features[layer].shape[2:]
-                mask = layer_mask(coverage, (height, width), self.config.erosion)
+                mask = layer_mask(seen.coverage, (height, width), self.config.erosion)
             grams.append(gram_matrix(features[layer], mask))
         return grams
 

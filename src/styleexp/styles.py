@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
-    from styleexp.config import StyleConfig, ViewsConfig
+    from styleexp.config import Config, StyleConfig, ViewsConfig
     from styleexp.losses import Grams, StyleLoss
     from styleexp.viewer import Viewer
 
@@ -27,7 +27,9 @@ BANK_STEP = 1_000_000
 class StyleTarget(Protocol):
     """The Grams that the generated mesh should have in a step: of global and of local views."""
 
-    def __call__(self, step: int) -> tuple[Grams, Grams]: ...
+    def __call__(self, step: int) -> tuple[Grams, Grams]:
+        """The Grams for this step."""
+        ...
 
 
 class FixedTarget:
@@ -35,10 +37,7 @@ class FixedTarget:
 
     def __init__(self, loss: StyleLoss, batches: Iterator[tuple[Images, Images]]):
         with torch.no_grad():
-            pairs = [
-                (loss.grams(whole.image, whole.coverage), loss.grams(local.image, local.coverage))
-                for whole, local in batches
-            ]
+            pairs = [(loss.grams(whole), loss.grams(local)) for whole, local in batches]
         self.grams = _mean([g for g, _ in pairs]), _mean([g for _, g in pairs])
 
     def __call__(self, step: int) -> tuple[Grams, Grams]:
@@ -56,70 +55,66 @@ class SameViewsTarget:
     def __call__(self, step: int) -> tuple[Grams, Grams]:
         """Grams of the style mesh at this step's views."""
         whole, local = self.viewer(self.vertices, step)
-        return (
-            self.loss.grams(whole.image, whole.coverage),
-            self.loss.grams(local.image, local.coverage),
-        )
+        return self.loss.grams(whole), self.loss.grams(local)
 
 
-def mesh_bank(
-    viewer: Viewer, vertices: Float[Tensor, "vertices 3"], bank_views: int
-) -> Iterator[tuple[Images, Images]]:
-    """Views of a style mesh, in batches of a step's size."""
-    batches = max(1, round(bank_views / viewer.config.count))
-    for batch in range(batches):
-        with torch.no_grad():
-            yield viewer(vertices, BANK_STEP + batch)
+def mesh_target(
+    loss: StyleLoss, viewer: Viewer, vertices: Float[Tensor, "vertices 3"]
+) -> FixedTarget:
+    """Grams of a mesh, averaged over a bank of its views."""
+    batches = max(1, round(loss.config.bank_views / viewer.config.count))
+    return FixedTarget(loss, (viewer(vertices, BANK_STEP + batch) for batch in range(batches)))
 
 
 def image_bank(
-    picture: Float[Tensor, "height width"],
-    style: StyleConfig,
-    config: ViewsConfig,
-    bank_views: int,
-    seed: int,
+    picture: Float[Tensor, "height width"], config: Config
 ) -> Iterator[tuple[Images, Images]]:
     """Windows of a style picture with the texel density that the views of the result have.
 
-    The picture's longer side spans ``image_tile * scale`` radii of the source; it is mirrored at its
-    borders where a view is wider. Each batch holds ``count`` global and ``count * per_view`` local
+    The picture's longer side spans ``image_tile * scale`` radii of the source; it is mirrored at
+    its borders where a view is wider. Each batch holds ``count`` global and ``count * per_view`` local
     windows at random places.
     """
-    batches = max(1, round(bank_views / config.count))
-    radius = global_texels(config)
-    local_radius = local_texels(config)
-    for batch in range(batches):
-        generator = views.step_generator(seed, BANK_STEP + batch, stream=2)
+    views_, local = config.views, config.views.local
+    span = config.style.image_tile * config.style.scale
+    for generator in _batches(config):
         yield (
-            _windows(picture, style, radius, config.resolution, config.count, generator),
+            _windows(
+                picture, span * global_texels(views_), views_.resolution, views_.count, generator
+            ),
             _windows(
                 picture,
-                style,
-                local_radius,
-                config.local.size,
-                config.count * config.local.per_view,
+                span * local_texels(views_),
+                local.size,
+                views_.count * local.per_view,
                 generator,
             ),
         )
 
 
 def whole_image_bank(
-    picture: Float[Tensor, "height width"], config: ViewsConfig, bank_views: int, seed: int
+    picture: Float[Tensor, "height width"], config: Config
 ) -> Iterator[tuple[Images, Images]]:
     """The paper's reading: the picture itself is the global view, local views are its crops."""
-    size = [config.resolution, config.resolution]
+    count, local = config.views.count, config.views.local
+    size = [config.views.resolution, config.views.resolution]
     resized = functional.interpolate(
         picture[None, None], size, mode="bilinear", antialias=True, align_corners=False
     )
-    image = resized.permute(0, 2, 3, 1).expand(config.count, -1, -1, -1)
-    everywhere = torch.ones_like(image[..., 0])
-    for batch in range(max(1, round(bank_views / config.count))):
-        generator = views.step_generator(seed, BANK_STEP + batch, stream=2)
-        windows, view = views.crop_windows(config.local, config.count, generator)
-        local = views.crop_images(
-            image, windows.to(image), view.to(image.device), config.local.size
-        )
-        yield Images(image, everywhere), Images(local, torch.ones_like(local[..., 0]))
+    image = resized.permute(0, 2, 3, 1).expand(count, -1, -1, -1)
+    for generator in _batches(config):
+        windows, view = views.crop_windows(local, count, generator)
+        cut = views.crop_images(image, windows.to(image), view.to(image.device), local.size)
+        yield _all_seen(image), _all_seen(cut)
+
+
+def _batches(config: Config) -> Iterator[torch.Generator]:
+    for batch in range(max(1, round(config.loss.bank_views / config.views.count))):
+        yield views.step_generator(config.optim.seed, BANK_STEP + batch, stream=2)
+
+
+def _all_seen(image: Float[Tensor, "n height width channels"]) -> Images:
+    return Images(image, torch.ones_like(image[..., 0]))
 
 
 def tone(
@@ -151,26 +146,22 @@ def local_texels(config: ViewsConfig) -> float:
 
 def _windows(
     picture: Float[Tensor, "height width"],
-    style: StyleConfig,
-    texels: float,
+    longer_side: float,
     size: int,
     count: int,
     generator: torch.Generator,
 ) -> Images:
-    longer = max(picture.shape)
-    factor = texels * style.image_tile * style.scale / longer
+    factor = longer_side / max(picture.shape)
     shape = [max(8, round(side * factor)) for side in picture.shape]
     resized = functional.interpolate(
         picture[None, None], shape, mode="bilinear", antialias=True, align_corners=False
     )[0, 0]
-    offsets = torch.rand(count, 2, generator=generator)
     cut = []
-    for dy, dx in offsets.tolist():
+    for dy, dx in torch.rand(count, 2, generator=generator).tolist():
         rows = _mirrored(int(dy * 2 * shape[0]), size, shape[0], picture.device)
         columns = _mirrored(int(dx * 2 * shape[1]), size, shape[1], picture.device)
         cut.append(resized[rows][:, columns])
-    image = torch.stack(cut)[..., None]
-    return Images(image, torch.ones_like(image[..., 0]))
+    return _all_seen(torch.stack(cut)[..., None])
 
 
 def _mirrored(start: int, count: int, size: int, device: torch.device) -> Tensor:

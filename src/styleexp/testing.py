@@ -148,18 +148,30 @@ def crop_is_part_of_whole(renderer: Renderer) -> None:
     vertices, faces = bumpy_sphere(3)
     camera = _cameras(1, focal=2.0)
     whole = _render(renderer, vertices, faces, camera, size=(128, 128))
-    top, left, size = 24, 40, 32
-    zoom = 128 / size
-    middle_x, middle_y = (left + size / 2) / 64 - 1, 1 - (top + size / 2) / 64
-    crop = replace(
-        camera,
-        focal=camera.focal * zoom,
-        center=(camera.center - torch.tensor([[middle_x, middle_y]])) * zoom,
-    )
-    part = _render(renderer, vertices, faces, crop, size=(size, size))
-    window = whole.image[:, top + 1 : top + size - 1, left + 1 : left + size - 1]
-    difference = (part.image[:, 1:-1, 1:-1] - window).abs()
+    top, left, height, width = 24, 40, 32, 48
+    zoom = torch.tensor([[128 / width, 128 / height]])
+    middle = torch.tensor([[(left + width / 2) / 64 - 1, 1 - (top + height / 2) / 64]])
+    crop = replace(camera, focal=camera.focal * zoom, center=(camera.center - middle) * zoom)
+    part = _render(renderer, vertices, faces, crop, size=(height, width))
+    window = whole.image[:, top : top + height, left : left + width]
+    difference = (part.image - window)[:, 1:-1, 1:-1].abs()  # outlines next to the frame may differ
     assert (difference > 0.01).float().mean() < 0.01, difference.mean()
+
+
+def hidden_outlines_do_not_show(renderer: Renderer) -> None:
+    """What lies wholly behind a surface changes neither picture nor gradient."""
+    wall = torch.tensor([[-4.0, -4, 1.2], [4, -4, 0.9], [4, 4, 0.8], [-4, 4, 1.1]])
+    wall_faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    behind, faces = bumpy_sphere(3)
+    vertices = torch.cat([wall, 0.6 * behind]).requires_grad_()
+    light = Shading(background=0.0)
+    alone = _render(renderer, wall, wall_faces, _front_camera(), light)
+    out = _render(renderer, vertices, torch.cat([wall_faces, faces + 4]), _front_camera(), light)
+    assert torch.allclose(out.image, alone.image, atol=1e-4)
+    if renderer.capabilities.differentiable_shading:
+        weight = _weight(32)[:, :, None]
+        (gradient,) = torch.autograd.grad((out.image * weight).sum(), vertices)
+        assert gradient[4:].abs().max() < 1e-4 * gradient[:4].abs().max()
 
 
 def larger_than_the_frame(renderer: Renderer) -> None:
@@ -416,6 +428,26 @@ def sphere_area(renderer: Renderer) -> None:
     _assert_near(float(gradient), slope, 0.02)
 
 
+def rough_outline(renderer: Renderer) -> None:
+    """Where many edges lie close along an outline, it still counts once: coverage by scale."""
+    _need(renderer.capabilities.differentiable_visibility, "visibility")
+    vertices, faces = icosphere(5)
+    generator = torch.Generator().manual_seed(0)
+    vertices = vertices * (0.9 + 0.02 * torch.rand(len(vertices), 1, generator=generator))
+
+    def total(moved: Tensor, size: int) -> Tensor:
+        out = _render(renderer, moved, faces, _cameras(1), EVEN, (size, size))
+        return out.coverage.double().mean()
+
+    scale = torch.tensor(1.0, requires_grad=True)
+    area = total(vertices * scale, 100)
+    _need(area.requires_grad, "visibility")
+    (gradient,) = torch.autograd.grad(area, scale)
+    with torch.no_grad():
+        change = total(vertices * 1.01, 1000) - total(vertices * 0.99, 1000)
+    _assert_near(float(gradient), float(change) / 0.02, 0.1)
+
+
 def triangle_area(renderer: Renderer) -> None:
     """One triangle's covered area and its gradient by each corner."""
     size = 128
@@ -457,6 +489,7 @@ CHECKS: tuple[Check, ...] = (
     equal_depth_goes_to_lowest_index,
     orientation,
     crop_is_part_of_whole,
+    hidden_outlines_do_not_show,
     larger_than_the_frame,
     crossing_the_near_plane,
     depth_on_receding_quad,
@@ -471,6 +504,7 @@ CHECKS: tuple[Check, ...] = (
     colours_stay_in_range,
     shading_gradient,
     sphere_area,
+    rough_outline,
     triangle_area,
     gradient_of_scale,
     gradient_of_smooth_field,

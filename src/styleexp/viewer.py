@@ -11,13 +11,14 @@ import torch
 from styleexp import views
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Float
     from torch import Tensor
 
-    from styleexp.config import ViewsConfig
+    from styleexp.config import Config
+    from styleexp.geometry import Surface
     from styleexp.renderers.base import Cameras, Renderer, Shading
 
-SURFACE_BANK = 512
+SURFACE_BANK = 192
 """How many surface points the local views of a run are drawn from."""
 
 
@@ -33,70 +34,56 @@ class Viewer:
     """Renders a mesh's views for any step; equal seeds see equal views.
 
     ``scale`` enlarges what is seen: the style mesh is shown larger to make its pattern come out
-    larger on the result. ``light`` is "fixed" or "random" (see ``ShadingConfig``).
+    larger on the result.
     """
 
     def __init__(
         self,
-        config: ViewsConfig,
+        config: Config,
         renderer: Renderer,
         shading: Shading,
-        vertices: Float[Tensor, "vertices 3"],
-        faces: Int[Tensor, "faces 3"],
-        normals: Float[Tensor, "vertices 3"],
-        *,
-        light: str = "fixed",
+        surface: Surface,
         scale: float = 1.0,
-        seed: int = 0,
     ):
-        self.config = config
+        self.config = config.views
+        self.light_spread = config.shading.light_spread
+        self.seed = config.optim.seed
         self.renderer = renderer
         self.shading = shading
-        self.faces = faces
-        self.light = light
+        self.faces = surface.faces
         self.scale = scale
-        self.seed = seed
-        self.surface: Cameras | None = None
-        if config.local.mode == "surface":
-            self.surface = views.surface_cameras(
-                vertices,
-                faces,
-                normals,
-                config.local.extent / scale,
+        self.surface_cameras: Cameras | None = None
+        if self.config.local.mode == "surface":
+            self.surface_cameras = views.surface_cameras(
+                surface,
+                self.config.local.extent / scale,
                 SURFACE_BANK,
-                views.step_generator(seed, 0, stream=1),
+                views.step_generator(self.seed, 0, stream=1),
                 renderer,
                 shading,
             )
 
-    def __call__(
-        self, vertices: Float[Tensor, "vertices 3"], step: int, count: int | None = None
-    ) -> tuple[Images, Images]:
+    def __call__(self, vertices: Float[Tensor, "vertices 3"], step: int) -> tuple[Images, Images]:
         """Global and local views of the mesh with these vertices."""
         generator = views.step_generator(self.seed, step)
-        count = self.config.count if count is None else count
-        cameras = views.sample_global(self.config, generator, vertices.device, count)
+        cameras = views.sample_global(self.config, generator, vertices.device)
         cameras = views.zoom(cameras, self.scale)
         size = self.config.resolution
         whole = self._render(vertices, cameras, size, generator)
-        return self._perspective(whole, generator), self._local(
-            vertices, cameras, whole, count, generator
-        )
+        return self._perspective(whole, generator), self._local(vertices, cameras, whole, generator)
 
     def _local(
         self,
         vertices: Float[Tensor, "vertices 3"],
         cameras: Cameras,
         whole: Images,
-        count: int,
         generator: torch.Generator,
     ) -> Images:
-        local = self.config.local
-        if self.surface is not None:
-            chosen = torch.randint(
-                len(self.surface), (count * local.per_view,), generator=generator
-            )
-            return self._render(vertices, self.surface[chosen], local.size, generator)
+        local, count = self.config.local, self.config.count
+        if self.surface_cameras is not None:
+            bank = self.surface_cameras
+            chosen = torch.randint(len(bank), (count * local.per_view,), generator=generator)
+            return self._render(vertices, bank[chosen], local.size, generator)
         windows, view = views.crop_windows(local, count, generator)
         windows, view = windows.to(vertices), view.to(vertices.device)
         if local.mode == "zoom":
@@ -115,8 +102,9 @@ class Viewer:
         generator: torch.Generator,
     ) -> Images:
         shading = self.shading
-        if self.light == "random":
-            shading = replace(shading, light=random_light(shading, len(cameras), generator))
+        if self.light_spread > 0:
+            light = turned_light(shading, self.light_spread, len(cameras), generator)
+            shading = replace(shading, light=light)
         out = self.renderer.render(vertices, self.faces, cameras, shading, (size, size))
         return Images(out.image, out.coverage)
 
@@ -132,11 +120,11 @@ class Viewer:
         return Images(both[..., :-1], both[..., -1] - self.config.perspective_fill)
 
 
-def random_light(
-    shading: Shading, count: int, generator: torch.Generator
+def turned_light(
+    shading: Shading, spread: float, count: int, generator: torch.Generator
 ) -> Float[Tensor, "views 3"]:
-    """The light turned about the viewing axis by a random angle for each view."""
-    light = torch.as_tensor(shading.light, dtype=torch.float32)
-    angle = 2 * math.pi * torch.rand(count, generator=generator)
-    across = light[:2].norm()
-    return torch.stack([across * angle.cos(), across * angle.sin(), light[2].expand(count)], dim=1)
+    """The light turned about the viewing axis, for each view by up to ``spread`` degrees."""
+    x, y, z = torch.as_tensor(shading.light, dtype=torch.float32)
+    angle = math.radians(spread) * (2 * torch.rand(count, generator=generator) - 1)
+    cos, sin = angle.cos(), angle.sin()
+    return torch.stack([x * cos - y * sin, x * sin + y * cos, z.expand(count)], dim=1)

@@ -1,4 +1,4 @@
-"""Views: where the cameras stand, and the image views taken of their renders (Sec. 3.3.1, Eq. 2)."""
+"""Where the cameras stand, and the image views taken of their renders (Sec. 3.3.1, Eq. 2)."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from styleexp.config import LocalViewsConfig, ViewsConfig
+    from styleexp.geometry import Surface
     from styleexp.renderers.base import Renderer, Shading
 
 POLE_GUARD = math.radians(85.0)
@@ -186,9 +187,7 @@ def homography(
 
 
 def surface_cameras(
-    vertices: Float[Tensor, "vertices 3"],
-    faces: Int[Tensor, "faces 3"],
-    normals: Float[Tensor, "vertices 3"],
+    surface: Surface,
     extent: float,
     count: int,
     generator: torch.Generator,
@@ -202,15 +201,15 @@ def surface_cameras(
     stays up, which keeps the direction of stripes. Points hidden from their camera by another part
     of the mesh are left out; what remains is at most ``count`` cameras.
     """
-    points, directions = sample_surface(vertices, faces, normals, 2 * count, generator)
+    points, directions = sample_surface(surface, 2 * count, generator)
     distance = extent / (2 * math.tan(math.radians(SURFACE_FOV) / 2))
     cameras = look_at(points + distance * directions, points, SURFACE_FOV)
     with torch.no_grad():
-        depth = renderer.render(vertices, faces, cameras, shading, (9, 9)).depth
+        depth = renderer.render(surface.vertices, surface.faces, cameras, shading, (9, 9)).depth
     if depth is None:
-        return cameras[torch.arange(count)]
-    seen = (depth[:, 4, 4] - distance).abs() < 0.1 * distance
-    return cameras[seen.nonzero().squeeze(1)[:count]]
+        return cameras[:count]
+    seen = ((depth[:, 4, 4] - distance).abs() < 0.1 * distance).nonzero().squeeze(1)
+    return cameras[seen[:count]] if len(seen) else cameras[:count]
 
 
 def _to(cameras: Cameras, device: torch.device) -> Cameras:

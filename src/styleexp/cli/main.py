@@ -1,4 +1,4 @@
-"""``styleexp``: compose the configuration, run, and say in one sentence what went wrong if it did."""
+"""``styleexp``: compose the configuration, run, and say in one sentence what went wrong."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def _hydra() -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"
 
     @hydra.main(version_base="1.3", config_path=compose.CONFIG_PATH, config_name="config")
-    def job(config):  # type: ignore[no-untyped-def]
+    def job(config):
         from pathlib import Path
 
         from hydra.core.hydra_config import HydraConfig

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from styleexp.config import Config
-    from styleexp.stylize import Scene, State, Step
+    from styleexp.scene import Scene
+    from styleexp.stylize import State, Step
 
 
 def run(config: Config, folder: Path, overrides: list[str]) -> int:
@@ -67,15 +68,17 @@ def _fail(folder: records.RunFolder, reason: str) -> None:
 def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resumed: bool) -> int:
     import torch
 
-    from styleexp import sources, stylize
+    from styleexp import sources
+    from styleexp.scene import prepare
+    from styleexp.stylize import optimise, start
 
     if config.threads:
         torch.set_num_threads(config.threads)
     started = time.perf_counter()
-    scene = stylize.prepare(config)
+    scene = prepare(config)
     for note in scene.notes:
         print(f"note: {note}")
-    state = stylize.start(scene)
+    state = start(scene)
     if resumed:
         told = folder.load_checkpoint(state)
         if told:
@@ -83,7 +86,7 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
         print(f"resuming at step {state.step} of {config.optim.steps}")
         folder.truncate_metrics(state.step)
     record |= {
-        "device": str(scene.vertices.device),
+        "device": str(scene.surface.vertices.device),
         "encoder_precision": scene.loss.encoder.precision,
         "threads": torch.get_num_threads(),
         "assets": sources.describe(config),
@@ -92,7 +95,7 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
     folder.write_json("run.json", record)
 
     with _interruptible() as interrupted:
-        for step in _progress(stylize.optimise(scene, state), state, config.optim.steps):
+        for step in _progress(optimise(scene, state), state, config.optim.steps):
             folder.append_metrics(step)
             if state.step % config.optim.checkpoint_every == 0 or interrupted:
                 folder.save_checkpoint(state)
@@ -111,9 +114,10 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
 
 
 def _write_results(scene: Scene, state: State, folder: records.RunFolder) -> list[Path]:
-    from styleexp import previews, stylize
+    from styleexp import previews
+    from styleexp.stylize import finish
 
-    result = stylize.finish(scene, state)
+    result = finish(scene, state)
     for name in ("result.ply", "result.obj", "result.glb"):
         result.save(folder.path / name)
     folder.write("preview.png", lambda path: previews.write_preview(result, path))

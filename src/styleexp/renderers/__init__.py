@@ -1,0 +1,1 @@
+"""Rendering backends: the contract in `base`, the built-in ones by name in `specs`."""

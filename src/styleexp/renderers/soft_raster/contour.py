@@ -8,9 +8,9 @@ colour by the part ``s - 0.5`` or, where that is negative, the inner pixel the o
 derivative of what an area-averaging camera sees.
 
 Searching edges rather than the visible triangles' neighbours matters: with faces smaller than
-pixels the triangle seen at a pixel centre hardly ever owns the outline next to it. Steep edges are
-searched for along rows, the others along columns. Where several edges pass between the same two
-pixels only the outermost counts.
+pixels the triangle seen at a pixel centre hardly ever owns the outline next to it. Where several
+edges pass between the same two pixels only the outermost counts. Of the pairs of pixels in rows,
+and in columns, that an edge separates one kind is enough: rows for a steep edge, or else columns.
 """
 
 from __future__ import annotations
@@ -79,7 +79,9 @@ class _Segments:
     start: Int[Tensor, " m"]
     end: Int[Tensor, " m"]
     along_row: Bool[Tensor, " m"]
-    """Steep: its scan lines are rows; those of the others are columns."""
+    """Whether the scan lines are rows (or else columns); every edge is there once with either."""
+    preferred: Bool[Tensor, " m"]
+    """Whether the scan lines are those that cross the edge at the greater angle."""
     first: Int[Tensor, " m"]
     """First scan line whose pixel centres it passes between."""
     count: Int[Tensor, " m"]
@@ -98,18 +100,20 @@ def find_crossings(
 ) -> Crossings:
     """All places where a visible contour edge separates two pixels."""
     edges = _contour_edges(points, corners, across, front, pairs)
-    segments = _segments(points, *edges, near, visible.depth)
-    found, distances = [], []
+    segments = _segments(points, edges, near, visible.depth)
+    found, distances, preferred = [], [], []
     begin = 0
     for size in chunks(segments.count):
         part = _part(segments, slice(begin, begin + size))
-        crossings, distance = _seen_crossings(part, visible.depth)
+        crossings, distance, best = _seen_crossings(part, visible.depth)
         found.append(crossings)
         distances.append(distance)
+        preferred.append(best)
         begin += size
     columns = [[getattr(crossings, f.name) for crossings in found] for f in fields(Crossings)]
     every = Crossings(*(torch.cat(column, dim=-1) for column in columns))
-    return _part(every, _outermost(every, torch.cat(distances)))
+    outermost = _outermost(every, torch.cat(distances))
+    return _part(every, outermost[torch.cat(preferred)[outermost]])
 
 
 def _part(record: Any, index: slice | Tensor) -> Any:
@@ -136,16 +140,9 @@ def _contour_edges(
     return tuple(torch.cat(parts) for parts in zip(*found, strict=True))
 
 
-def _segments(
-    points: Tensor,
-    view: Tensor,
-    face: Tensor,
-    start: Tensor,
-    end: Tensor,
-    near: float,
-    depth: Tensor,
-) -> _Segments:
+def _segments(points: Tensor, edges: tuple[Tensor, ...], near: float, depth: Tensor) -> _Segments:
     """Cut edges at the near plane, project them and choose their scan lines."""
+    start, end = edges[2:]
     height, width = depth.shape[1:]
     flat = points.reshape(3, -1)
     a, b = flat.index_select(1, start), flat.index_select(1, end)
@@ -156,18 +153,23 @@ def _segments(
     p, q = [
         torch.cat([end[:2], torch.ones_like(end[2:])]) / end[2].clamp_min(near) for end in (p, q)
     ]
-    along_row = (q[1] - p[1]).abs() >= (q[0] - p[0]).abs()
+    steep = (q[1] - p[1]).abs() >= (q[0] - p[0]).abs()
 
+    # An edge competes for being the outermost along both, though only one will be used.
+    along_row = torch.cat([torch.ones_like(steep), torch.zeros_like(steep)])
+    preferred = torch.cat([steep, ~steep])
+    p, q, ahead = p.repeat(1, 2), q.repeat(1, 2), (a_front | b_front).repeat(2)
+    view, face, start, end = (edge.repeat(2) for edge in edges)
     from_p, from_q = torch.where(along_row, p[1], p[0]), torch.where(along_row, q[1], q[0])
     lines = torch.where(along_row, height, width)
     first = torch.ceil(torch.minimum(from_p, from_q) - 0.5).clamp_min(0)
     beyond = torch.minimum(torch.ceil(torch.maximum(from_p, from_q) - 0.5), lines)
-    count = torch.where(a_front | b_front, beyond - first, 0.0).nan_to_num(nan=0.0).clamp_min(0)
-    return _Segments(p, q, view, face, start, end, along_row, first.long(), count.long())
+    count = torch.where(ahead, beyond - first, 0.0).nan_to_num(nan=0.0).clamp_min(0)
+    return _Segments(p, q, view, face, start, end, along_row, preferred, first.long(), count.long())
 
 
-def _seen_crossings(segments: _Segments, depth: Tensor) -> tuple[Crossings, Tensor]:
-    """Where segments pass between two pixels, in front of the farther; and the distances ``s``."""
+def _seen_crossings(segments: _Segments, depth: Tensor) -> tuple[Crossings, Tensor, Tensor]:
+    """Where segments pass between two pixels, in front of the farther; ``s``, and ``preferred``."""
     height, width = depth.shape[1:]
     owner, step = ragged(segments.count)
     p, q = segments.p.index_select(1, owner), segments.q.index_select(1, owner)
@@ -219,7 +221,7 @@ def _seen_crossings(segments: _Segments, depth: Tensor) -> tuple[Crossings, Tens
         segments.view[owner[kept]],
         segments.face[owner[kept]],
     )
-    return crossings, distance[kept]
+    return crossings, distance[kept], segments.preferred[owner[kept]]
 
 
 def _outermost(crossings: Crossings, distance: Tensor) -> Int[Tensor, " pixel_pairs"]:
@@ -283,9 +285,9 @@ class CrossingDistance(torch.autograd.Function):
 class Blend(torch.autograd.Function):
     """Mix pixels across outlines.
 
-    Takes values (channels, pixels) and, of n crossings, the distances ``s`` (n), the values right at
-    the outline, on its inside (channels, n), and the inner and outer pixels (n). A pixel takes the
-    part ``|s - 0.5|`` of its neighbour; if its neighbours' parts come to more than one they are
+    Takes values (channels, pixels) and, of n crossings, the distances ``s`` (n), the values right
+    at the outline, on its inside (channels, n), and the inner and outer pixels (n). A pixel takes
+    the part ``|s - 0.5|`` of its neighbour; if its neighbours' parts come to more than one they are
     scaled to one, so that a result never leaves the range of what it mixes.
 
     What an outline sweeps over changes from the outer pixel's value to that at the outline. That,

@@ -33,6 +33,11 @@ class SoftRaster(Renderer):
     (one channel), float32 or float64 after the vertices, any device that torch knows. On the CPU
     the same input gives the same bits, also in the gradients. Raises ``UserError`` for an unknown
     ``visibility_gradient`` or ``Shading.normals``.
+
+    Against finite differences of an 8 times supersampled render, gradients of smoothly shaded
+    images and of coverage are within 10 %. Those of flat shaded images lack one thing: the borders
+    between neighbouring faces' grey levels move too, and only outlines are accounted for here.
+    ``capabilities`` are those of ``contour``.
     """
 
     capabilities = Capabilities(

@@ -94,7 +94,8 @@ class SmoothSurface:
             ends.append(normals.index_select(1, index - first))
         span = sides[0] - sides[1]
         share = torch.where(span == 0, 0.5, sides[0] / span).clamp(0, 1)
-        return _lit(unit(torch.lerp(*ends, share)), crossings.view, self.light, self.shading)
+        normal = unit(torch.lerp(ends[0], ends[1], share))
+        return _lit(normal, crossings.view, self.light, self.shading)
 
 
 def _lit(normal: Tensor, view: Tensor, light: Tensor, shading: Shading) -> Tensor:
