@@ -37,15 +37,17 @@ class StyleConfig:
     scale: float = 1.0
     """Size of the pattern on the result: 2 makes its features twice as large."""
     scale_by: str = "area"
-    """Mesh styles: what ``scale`` 1 means. ``area``: the result carries as many features as the
-    style mesh. ``frame``: both meshes fill the unit sphere, as in the paper."""
+    """What ``scale`` 1 means. ``area``: the result carries as many features as the style mesh, since
+    lengths are compared by the square roots of the surfaces; ``field.sigma`` and ``field.bound`` then
+    go with the pattern, too. ``frame``: both meshes fill the unit sphere, as in the paper."""
     image_contrast: float | None = 0.12
     """Image styles: standard deviation that the picture's tone is brought to (it sets the height of
     the relief); null keeps the picture's own contrast."""
     image_match_mean: bool = True
     """Image styles: shift the picture's mean tone to the mean of the rendered source."""
     image_tile: float = 1.0
-    """Image styles: how many source radii the picture's longer side spans on the result."""
+    """Image styles: what the picture's longer side spans on the result, in radii: the source's own
+    (``scale_by=frame``) or those of the sphere with the source's surface (``area``)."""
 
 
 @dataclass
@@ -54,7 +56,8 @@ class FieldConfig:
 
     name: str = "fourier_mlp"
     sigma: float = 5.0
-    """Standard deviation of the frequency matrix B (Fig. 7)."""
+    """Standard deviation of the frequency matrix B (Fig. 7), in cycles per radius; see
+    ``style.scale_by``."""
     features: int = 128
     """Rows of B; the encoding has twice as many entries (h_f = 256)."""
     include_input: bool = False
@@ -65,7 +68,7 @@ class FieldConfig:
     depth: int = 8
     """Fully connected layers, the output layer included."""
     bound: float = 0.1
-    """Displacements lie in (-bound, bound), in radii of the normalised source."""
+    """Displacements lie in (-bound, bound), in radii; see ``style.scale_by``."""
     zero_mean: bool = True
     """Subtract the area-weighted mean displacement, so that the mesh can't shrink as a whole."""
 
@@ -150,9 +153,9 @@ class LossConfig:
         default_factory=lambda: ["conv1_1", "conv2_1", "conv3_1", "conv4_1", "conv5_1"]
     )
     """Style layers, by name or by the paper's 1-based index of VGG-19's convolutions."""
-    block_weights: list[float] = option(default_factory=lambda: [1.0, 1.0, 1.0, 0.2, 0.1])
+    block_weights: list[float] = option(default_factory=lambda: [1.0, 1.0, 1.0, 1.0, 1.0])
     """A weight for the layers of each of VGG's five blocks."""
-    lambda_global: float = 1.0
+    lambda_global: float = 0.3
     lambda_local: float = 1.0
     """lambda of Eq. 7 (paper: 0.1)."""
     masked: bool = True
@@ -174,7 +177,10 @@ class OptimConfig:
     """Adam with a stepped rate (Sec. 4.1)."""
 
     steps: int = 150
-    rate: float = 1e-3
+    rate: float = 2e-3
+    schedule: str = "cosine"
+    """``step``: the rate is multiplied by ``decay`` every ``decay_every`` steps, as in the paper.
+    ``cosine``: it falls to a twentieth over the run, so that the last steps settle."""
     decay: float = 0.9
     decay_every: int = 100
     seed: int = 0
@@ -225,6 +231,7 @@ CHOICES = {
     "encoder.precision": ("auto", "fp32", "bf16"),
     "encoder.pooling": ("max", "avg"),
     "encoder.normalisation": ("weights", "paper"),
+    "optim.schedule": ("step", "cosine"),
     "loss.relative": ("none", "target", "source"),
     "loss.target": ("bank", "same_views"),
 }

@@ -52,11 +52,11 @@ class DisplacementField(nn.Module):
     The last layer starts at zero, so that the generated mesh is the source mesh at step 0.
     """
 
-    def __init__(self, config: FieldConfig, generator: torch.Generator):
+    def __init__(self, config: FieldConfig, generator: torch.Generator, unit: float = 1.0):
         super().__init__()
-        self.bound = config.bound
+        self.bound = config.bound * unit
         self.encode = FourierFeatures(
-            config.features, config.sigma, config.include_input, generator
+            config.features, config.sigma / unit, config.include_input, generator
         )
         sizes = [self.encode.size] + [config.width] * (config.depth - 1) + [1]
         linears = [nn.Linear(a, b) for a, b in itertools.pairwise(sizes)]

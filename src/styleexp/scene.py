@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 
 from styleexp import meshes, styles
@@ -23,6 +22,7 @@ from styleexp.viewer import Viewer
 from styleexp.views import orbit
 
 if TYPE_CHECKING:
+    import numpy as np
     from jaxtyping import Float
     from torch import Tensor
 
@@ -42,6 +42,8 @@ class Scene:
     frame: meshes.Normalisation
     surface: Surface
     areas: Float[Tensor, " vertices"]
+    unit: float
+    """Radii of the normalised source in which ``field.sigma`` and ``field.bound`` are given."""
     viewer: Viewer
     loss: StyleLoss
     target: StyleTarget
@@ -72,10 +74,24 @@ def prepare(config: Config) -> Scene:
     loss = StyleLoss(config.loss, encoder)
     viewer = Viewer(config, renderer, shading, surface)
     notes = list(source.repairs)
+    target: StyleTarget
     if isinstance(style, meshes.Mesh):
-        target = mesh_target(config, loss, renderer, shading, source, style, device)
+        unit = pattern_unit(config.style, source, style)
+        _, styled = normalised(style, device)
+        style_viewer = Viewer(config, renderer, shading, styled, unit)
+        if config.loss.target == "same_views":
+            target = styles.SameViewsTarget(loss, style_viewer, styled.vertices)
+        else:
+            target = styles.mesh_target(loss, style_viewer, styled.vertices)
     else:
-        target = image_target(config, loss, style, grey, device)
+        unit = pattern_unit(config.style, source, None)
+        picture = styles.tone(torch.from_numpy(style).to(device), grey, config.style)
+        if config.loss.target == "same_views":
+            target = styles.FixedTarget(loss, styles.whole_image_bank(picture, config))
+        else:
+            target = styles.FixedTarget(loss, styles.image_bank(picture, config, unit))
+    if config.style.scale_by == "frame":
+        unit = 1.0
     goal, own = target(0), styles.mesh_target(loss, viewer, surface.vertices)(0)
     return Scene(
         config=config,
@@ -84,6 +100,7 @@ def prepare(config: Config) -> Scene:
         frame=frame,
         surface=surface,
         areas=vertex_areas(surface),
+        unit=unit,
         viewer=viewer,
         loss=loss,
         target=target,
@@ -92,44 +109,22 @@ def prepare(config: Config) -> Scene:
     )
 
 
-def mesh_target(
-    config: Config,
-    loss: StyleLoss,
-    renderer: Renderer,
-    shading: Shading,
-    source: meshes.Mesh,
-    style: meshes.Mesh,
-    device: torch.device,
-) -> StyleTarget:
-    """The target of a style mesh."""
-    _, surface = normalised(style, device)
-    scale = config.style.scale * scale_unit(config.style, source, style)
-    viewer = Viewer(config, renderer, shading, surface, scale)
-    if config.loss.target == "same_views":
-        return styles.SameViewsTarget(loss, viewer, surface.vertices)
-    return styles.mesh_target(loss, viewer, surface.vertices)
+def pattern_unit(config: StyleConfig, source: meshes.Mesh, style: meshes.Mesh | None) -> float:
+    """How large a pattern of size 1 is on the normalised source: see ``StyleConfig.scale_by``.
 
-
-def image_target(
-    config: Config, loss: StyleLoss, style: np.ndarray, grey: float, device: torch.device
-) -> StyleTarget:
-    """The target of a style image, in the tone of the source's renders."""
-    rgb = torch.from_numpy(style).to(device)
-    picture = styles.tone(rgb @ rgb.new_tensor([0.299, 0.587, 0.114]), grey, config.style)
-    whole = config.loss.target == "same_views"
-    batches = styles.whole_image_bank if whole else styles.image_bank
-    return styles.FixedTarget(loss, batches(picture, config))
-
-
-def scale_unit(config: StyleConfig, source: meshes.Mesh, style: meshes.Mesh) -> float:
-    """What ``style.scale=1`` magnifies the style mesh by: see ``StyleConfig.scale_by``."""
+    An image (``style`` None) counts as if it lay on the unit sphere.
+    """
     if config.scale_by == "frame":
-        return 1.0
-    areas = [
-        meshes.face_areas(m.vertices, m.faces).sum() / meshes.normalisation(m.vertices).scale ** 2
-        for m in (source, style)
-    ]
-    return float(np.sqrt(areas[0] / areas[1]))
+        return config.scale
+    sphere = math.sqrt(4 * math.pi)
+    unit = 1.0 if style is None else normalised_size(style) / sphere
+    return config.scale * normalised_size(source) / sphere / unit
+
+
+def normalised_size(mesh: meshes.Mesh) -> float:
+    """Square root of the mesh's area in the unit sphere."""
+    area = meshes.face_areas(mesh.vertices, mesh.faces).sum()
+    return math.sqrt(area) / meshes.normalisation(mesh.vertices).scale
 
 
 def normalised(mesh: meshes.Mesh, device: torch.device) -> tuple[meshes.Normalisation, Surface]:

@@ -67,16 +67,16 @@ def mesh_target(
 
 
 def image_bank(
-    picture: Float[Tensor, "height width"], config: Config
+    picture: Float[Tensor, "height width"], config: Config, unit: float
 ) -> Iterator[tuple[Images, Images]]:
     """Windows of a style picture with the texel density that the views of the result have.
 
-    The picture's longer side spans ``image_tile * scale`` radii of the source; it is mirrored at
-    its borders where a view is wider. Each batch holds ``count`` global and ``count * per_view`` local
+    The picture's longer side spans ``image_tile * unit`` radii of the source; it is mirrored at its
+    borders where a view is wider. Each batch holds ``count`` global and ``count * per_view`` local
     windows at random places.
     """
     views_, local = config.views, config.views.local
-    span = config.style.image_tile * config.style.scale
+    span = config.style.image_tile * unit
     for generator in _batches(config):
         yield (
             _windows(
@@ -118,9 +118,10 @@ def _all_seen(image: Float[Tensor, "n height width channels"]) -> Images:
 
 
 def tone(
-    picture: Float[Tensor, "height width"], mean: float, style: StyleConfig
+    rgb: Float[Tensor, "height width 3"], mean: float, style: StyleConfig
 ) -> Float[Tensor, "height width"]:
-    """The picture with the tone of a render: its mean and its contrast set the relief's height."""
+    """The picture in grey, with the tone of a render: its contrast sets the relief's height."""
+    picture = rgb @ rgb.new_tensor([0.299, 0.587, 0.114])  # luma, ITU-R BT.601
     centre = picture.mean()
     contrast = 1.0
     if style.image_contrast is not None:

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
+    from styleexp.config import OptimConfig
+
 
 @dataclass
 class State:
@@ -72,8 +74,8 @@ def stylize(source: str | Path, style: str | Path, *overrides: str) -> Result:
     """Put the local geometry of ``style``, a mesh or picture, onto the mesh ``source``.
 
     Both are names or files (what has a suffix or a folder is a file). ``overrides`` are those of
-    the command line: ``stylize("my.obj", "bubble", "profile=fast", "field.sigma=3")``. Writes nothing;
-    ``save`` of what it returns does. Raises `UserError` for what the command line would report.
+    the command line: ``stylize("my.obj", "bubble", "profile=fast", "field.sigma=3")``. Writes
+    nothing; ``save`` of what it returns does. Raises `UserError` for what the command line would report.
     """
     config = compose(overrides)
     for part, what in ((config.source, source), (config.style, style)):
@@ -89,7 +91,8 @@ def stylize(source: str | Path, style: str | Path, *overrides: str) -> Result:
 def start(scene: Scene) -> State:
     """The state before the first step: M = C."""
     optim = scene.config.optim
-    displacement_field = DisplacementField(scene.config.field, step_generator(optim.seed, 0, 7))
+    generator = step_generator(optim.seed, 0, stream=7)
+    displacement_field = DisplacementField(scene.config.field, generator, scene.unit)
     displacement_field.to(scene.surface.vertices.device)
     adam = torch.optim.Adam(displacement_field.parameters(), lr=optim.rate)
     return State(displacement_field, adam)
@@ -101,7 +104,7 @@ def optimise(scene: Scene, state: State) -> Iterator[Step]:
     while state.step < optim.steps:
         begun = time.perf_counter()
         for group in state.optimizer.param_groups:
-            group["lr"] = optim.rate * optim.decay ** (state.step // optim.decay_every)
+            group["lr"] = learning_rate(optim, state.step)
 
         displacement = displace(scene, state)
         generated = surface.vertices + displacement[:, None] * surface.normals
@@ -132,6 +135,14 @@ def optimise(scene: Scene, state: State) -> Iterator[Step]:
         )
 
 
+def learning_rate(optim: OptimConfig, step: int) -> float:
+    """The rate of a step: see ``OptimConfig.schedule``."""
+    if optim.schedule == "step":
+        return optim.rate * optim.decay ** (step // optim.decay_every)
+    progress = 0.5 * (1 + math.cos(math.pi * step / optim.steps))
+    return optim.rate * (0.05 + 0.95 * progress)
+
+
 def displace(
     scene: Scene, state: State, precision: torch.dtype | None = None
 ) -> Float[Tensor, " vertices"]:
@@ -144,7 +155,7 @@ def displace(
         opened = min(1.0, state.step / (config.progressive * scene.config.optim.steps))
     displacement = state.field(state.field.encode(scene.surface.vertices, opened), precision)
     if config.zero_mean:
-        displacement = zero_mean(displacement, scene.areas, config.bound)
+        displacement = zero_mean(displacement, scene.areas, state.field.bound)
     return displacement
 
 

@@ -1,0 +1,58 @@
+"""Meshes: load, check, repair, normalise, remesh, and save in the input's own frame.
+
+A file and an optimiser want different things of a mesh. The optimiser wants one vertex per point of
+the surface, so that a displacement cannot tear it open; a file keeps several wherever a texture,
+an edge or a colour has a seam. `load_mesh` welds by position and remembers the file's own rows,
+materials and nodes in a `Carrier`; `save_mesh` puts moved vertices back into them::
+
+    file rows (position, uv, normal, colour)  ── weld ──►  Mesh.vertices  ── optimise ──┐
+              ▲                                                                         │
+              └─────────────────────────── un-weld (Carrier.rows) ◄─────────────────────┘
+
+trimesh reads and writes every format but OBJ, whose faces it would group by material.
+
+Coordinates are float64 in the file's frame and scale, a glTF scene's in its world frame. Faces wind
+counter-clockwise seen from outside.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+from styleexp.meshes.mesh import (
+    Carrier,
+    Mesh,
+    Normalisation,
+    face_areas,
+    mean_edge_length,
+    normalisation,
+    vertex_normals,
+)
+
+if TYPE_CHECKING:
+    from styleexp.meshes.reading import load_mesh
+    from styleexp.meshes.remeshing import remesh
+    from styleexp.meshes.writing import save_mesh
+
+__all__ = [
+    "Carrier",
+    "Mesh",
+    "Normalisation",
+    "face_areas",
+    "load_mesh",
+    "mean_edge_length",
+    "normalisation",
+    "remesh",
+    "save_mesh",
+    "vertex_normals",
+]
+
+# These need trimesh, which is loaded when the first of them is used.
+_HOMES = {"load_mesh": "reading", "remesh": "remeshing", "save_mesh": "writing"}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'styleexp.meshes' has no attribute '{name}'")
+    return getattr(importlib.import_module(f"styleexp.meshes.{_HOMES[name]}"), name)

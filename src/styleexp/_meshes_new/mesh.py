@@ -1,0 +1,143 @@
+"""What a mesh is here, and its small quantities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from styleexp.errors import UserError
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int, UInt8
+
+
+@dataclass(frozen=True)
+class Carrier:
+    """What a file knows about its mesh beyond positions, in the file's own rows.
+
+    A row is one combination of position, uv, normal and colour; rows on a seam share a vertex.
+    """
+
+    corners: Int[np.ndarray, "faces 3"]
+    """Rows of each face, in the file's own winding."""
+    rows: Int[np.ndarray, " rows"]
+    """Welded vertex of each row."""
+    flipped: Bool[np.ndarray, " faces"]
+    """Faces that `Mesh.faces` winds the other way round."""
+    uv: Float[np.ndarray, "rows 2"] | None = None
+    """v points up, as in OBJ and PLY; glTF's points down."""
+    normals: Float[np.ndarray, "rows 3"] | None = None
+    """The file's normals: they say which corners are smooth together, not where they point now."""
+    colors: UInt8[np.ndarray, "rows 4"] | None = None
+    parts: tuple[str, ...] = ("mesh",)
+    face_part: Int[np.ndarray, " faces"] | None = None
+    materials: tuple[Any, ...] = ()
+    """trimesh's ``PBRMaterial``, each with its name."""
+    face_material: Int[np.ndarray, " faces"] | None = None
+    """-1 where a face has none."""
+    mtl: str = ""
+    """An OBJ file's material library, so that saving as OBJ loses none of its lines."""
+    textures: dict[str, bytes] = field(default_factory=dict)
+    """The image files by the names that ``mtl`` uses."""
+    scene: Any = None
+    """A glTF file's ``trimesh.Scene``; its geometries' vertices, in order, are the rows."""
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A triangle mesh for the optimiser, with what is needed to save it as it came."""
+
+    name: str
+    vertices: Float[np.ndarray, "vertices 3"]
+    """float64, one per position, in the input's own frame and scale."""
+    faces: Int[np.ndarray, "faces 3"]
+    """int64, in the file's order, counter-clockwise seen from outside."""
+    repairs: tuple[str, ...] = ()
+    """One readable sentence for each thing that was repaired or left out."""
+    carrier: Carrier | None = None
+
+
+@dataclass(frozen=True)
+class Normalisation:
+    """The similarity into the unit sphere: ``apply(v) = (v - center) / scale`` (Sec. 4.1)."""
+
+    center: Float[np.ndarray, " 3"]
+    scale: float
+    """Largest distance of a vertex from the centre, in the input's units."""
+
+    def apply(self, vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "vertices 3"]:
+        """From the input's frame into the unit sphere."""
+        return (vertices - self.center) / self.scale
+
+    def invert(self, vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "vertices 3"]:
+        """From the unit sphere back into the input's frame."""
+        return vertices * self.scale + self.center
+
+
+def normalisation(vertices: Float[np.ndarray, "vertices 3"]) -> Normalisation:
+    """Centre at the vertex mean, scale so that the farthest vertex has distance 1 (Sec. 4.1)."""
+    vertices = np.asarray(vertices, dtype=np.float64)
+    center = vertices.mean(axis=0)
+    scale = float(np.linalg.norm(vertices - center, axis=1).max())
+    if not np.isfinite(scale) or scale <= 0.0:
+        raise UserError("the mesh has no extent or non-finite vertices: it cannot be normalised.")
+    return Normalisation(center, scale)
+
+
+def face_areas(
+    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Float[np.ndarray, " faces"]:
+    """Area of each face, in squared units of the vertices."""
+    return 0.5 * np.linalg.norm(_crosses(vertices, faces), axis=1)
+
+
+def vertex_normals(
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    groups: Int[np.ndarray, "faces 3"] | None = None,
+) -> Float[np.ndarray, "vertices 3"]:
+    """Unit vertex normals, the faces' weighted by area.
+
+    Faces without area add nothing. A vertex whose normal cancels out or that no face uses gets the
+    direction from the vertices' mean to it, so that every normal is finite and of length 1.
+
+    ``groups`` numbers the corners that are smooth together, where a vertex at a hard edge has
+    several normals; the result then has a row for each group.
+    """
+    vertices = points = np.asarray(vertices, dtype=np.float64)
+    if groups is None:
+        groups = faces
+    else:
+        points = np.zeros((int(groups.max()) + 1, 3))
+        points[groups] = vertices[faces]
+    extent = float(np.ptp(vertices, axis=0).max()) or 1.0
+    # Unit extent, so that squares of tiny or huge coordinates neither vanish nor overflow.
+    crosses = np.repeat(_crosses(vertices / extent, faces), 3, axis=0)
+    sums = [np.bincount(groups.ravel(), crosses[:, k], minlength=len(points)) for k in range(3)]
+    normals = np.stack(sums, axis=1)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    lost = length[:, 0] < 1e-18
+    if lost.any():
+        outward = points[lost] - vertices.mean(axis=0)
+        reach = np.linalg.norm(outward, axis=1, keepdims=True)
+        up = np.array([0.0, 1.0, 0.0])
+        normals[lost] = np.where(reach > 1e-12 * extent, outward / np.maximum(reach, 1e-300), up)
+        length[lost] = 1.0
+    return normals / length
+
+
+def mean_edge_length(
+    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> float:
+    """Mean length of the edges, each counted once."""
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    edges = np.unique(edges[:, 0] * len(vertices) + edges[:, 1])
+    ends = vertices[np.stack([edges // len(vertices), edges % len(vertices)], axis=1)]
+    return float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean())
+
+
+def _crosses(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return np.cross(b - a, c - a)

@@ -1,0 +1,121 @@
+"""From a file's rows to a checked, welded, outward mesh."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import trimesh
+
+from styleexp.errors import UserError
+from styleexp.meshes.mesh import Carrier, Mesh, face_areas
+
+# Beyond this squares of coordinates overflow a double.
+_LARGEST = 1e100
+_SMALLEST = 1e-100
+# Points nearer to each other than this share of the extent are one vertex. It forgives the rounding
+# of a node's transform (1e-16), and is far below what float32 files can tell apart (6e-8).
+_WELD = 1e-9
+
+
+def plural(count: int, one: str, many: str) -> str:
+    """``1 face`` or ``2 faces``."""
+    return f"{count} {one if count == 1 else many}"
+
+
+def check_indices(corners: np.ndarray, count: int) -> None:
+    """Raise unless all corners are among ``count`` vertices."""
+    bad = corners[(corners < 0) | (corners >= count)]
+    if bad.size:
+        raise UserError(
+            f"has a face that refers to vertex {bad.flat[0]} (from 0), but there are only {count} "
+            "vertices: export the mesh again."
+        )
+
+
+def weld(name: str, points: np.ndarray, carrier: Carrier, notes: list[str]) -> Mesh:
+    """One vertex per position of the rows at ``points`` (rows, 3); ``carrier.rows`` is filled in.
+
+    Raises `UserError` with the end of a sentence that begins with the file's name.
+    """
+    points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    if len(carrier.corners) == 0:
+        what = "is a point cloud" if len(points) else "holds no mesh"
+        raise UserError(f"{what}: it has no faces; reconstruct or export a surface first.")
+    infinite = int((~np.isfinite(points).all(axis=1)).sum())
+    if infinite:
+        number = plural(infinite, "vertex", "vertices")
+        raise UserError(
+            f"has {number} with NaN or infinite coordinates: repair it in a mesh editor."
+        )
+    extent = float(np.ptp(points, axis=0).max())
+    if np.abs(points).max() > _LARGEST:
+        raise UserError(f"has coordinates beyond {_LARGEST:g}: scale the mesh down.")
+    if extent <= 0.0:
+        raise UserError("has no extent, all its vertices coincide: export it again, uncompressed.")
+    if extent < _SMALLEST:
+        raise UserError(f"is smaller than {_SMALLEST:g}: scale the mesh up.")
+    if np.abs(points).max() > 1e3 * extent:
+        notes.append("lies far from the origin, where PLY and GLB round coordinates; OBJ does not")
+
+    # First appearance gives a vertex its place and position, so an order without duplicates stays.
+    grid = np.round((points - points.min(axis=0)) / (extent * _WELD)).astype(np.int64)
+    _, first, inverse = np.unique(grid, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    vertices, rows = points[first[order]], np.argsort(order)[inverse.ravel()]
+    file_faces = rows[carrier.corners]
+
+    unit = (vertices - vertices.mean(axis=0)) / extent
+    degenerate = int((face_areas(unit, file_faces) <= 1e-20).sum())
+    if degenerate == len(file_faces):
+        raise UserError("has only degenerate faces, without any area: export the mesh again.")
+    if degenerate:
+        number = plural(degenerate, "degenerate face", "degenerate faces")
+        notes.append(f"ignored {number} for the normals")
+    flipped = _inside_out(unit, file_faces, notes)
+    faces = np.where(flipped[:, None], file_faces[:, ::-1], file_faces)
+
+    carrier = replace(carrier, rows=rows, flipped=flipped)
+    if carrier.uv is None and carrier.normals is None and carrier.colors is None:
+        carrier = replace(carrier, corners=file_faces, rows=np.arange(len(vertices)))
+    return Mesh(name, vertices, np.ascontiguousarray(faces), tuple(notes), carrier)
+
+
+def _inside_out(points: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.ndarray:
+    """Which faces to turn so that components agree with themselves and, if closed, face outwards.
+
+    trimesh's ``fix_winding`` follows one face of each component; here the majority decides.
+    """
+    n = len(faces)
+    mesh = trimesh.Trimesh(points, faces, process=False)
+    (f, g), shared = mesh.face_adjacency.T, mesh.face_adjacency_edges
+
+    def forward(face: np.ndarray) -> np.ndarray:
+        at = (faces[face] == shared[:, :1]).argmax(axis=1)
+        return faces[face, (at + 1) % 3] == shared[:, 1]
+
+    # Each face twice, as it is and turned: neighbours are joined the way that makes them agree.
+    # Components of this graph come in mirror pairs unless the surface is one-sided.
+    agree = forward(f) != forward(g)
+    pairs = [
+        np.stack([f, np.where(agree, g, g + n)], axis=1),
+        np.stack([f + n, np.where(agree, g + n, g)], axis=1),
+    ]
+    label = trimesh.graph.connected_component_labels(np.concatenate(pairs), node_count=2 * n)
+    as_is, turned = label[:n], label[n:]
+    votes = np.bincount(np.minimum(as_is, turned), np.sign(turned - as_is))
+    flipped = (as_is < turned) != (votes >= 0)[np.minimum(as_is, turned)]
+    flipped &= as_is != turned
+    remark = " (saved files keep the input's winding)"
+    if flipped.any():
+        number = plural(int(flipped.sum()), "face", "faces")
+        notes.append(f"turned {number} that disagreed with their neighbours{remark}")
+
+    agreed = np.where(flipped[:, None], faces[:, ::-1], faces)
+    mesh = trimesh.Trimesh(points, agreed, process=False)
+    trimesh.repair.fix_inversion(mesh, multibody=True)
+    inward = (mesh.faces != agreed).any(axis=1)
+    if inward.any():
+        which = "the mesh" if inward.all() else plural(int(inward.sum()), "face", "faces")
+        notes.append(f"turned {which} inside out, because the faces pointed inwards{remark}")
+    return flipped ^ inward
