@@ -8,8 +8,9 @@ import sys
 import numpy as np
 import pytest
 
-from styleexp import meshes, shapes
+from styleexp import shapes
 from styleexp.errors import UserError
+from styleexp.meshes.remeshing import unfit
 
 
 @pytest.fixture(scope="module", params=shapes.names())
@@ -34,7 +35,7 @@ def test_closed_manifold_one_component_and_outward(shape):
     backward = edges[:, 1] * count + edges[:, 0]
     assert len(np.unique(forward)) == len(forward)  # each edge once a direction: coherent ...
     np.testing.assert_array_equal(np.sort(forward), np.sort(backward))  # ... and closed
-    assert meshes._unfit(shape.vertices, faces) is None
+    assert unfit(shape.vertices, faces) is None
     euler = count - len(edges) // 2 + len(faces)
     assert euler == (0 if shape.name == "torus" else 2)  # 2 also says: one component
     a, b, c = (shape.vertices[faces[:, k]] for k in range(3))
@@ -94,7 +95,7 @@ def test_relief_is_the_height_of_the_mesh(name):
 
 @pytest.mark.parametrize("name", shapes.STYLES)
 def test_relief_is_visible_and_moderate(name):
-    directions, _ = shapes.icosphere(40_000)
+    directions, _ = shapes.icosphere(10_000)
     height = shapes.relief(name, directions)
     low, high = np.percentile(height, [1, 99])
     assert 0.025 < high - low < 0.14

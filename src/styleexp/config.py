@@ -37,9 +37,9 @@ class StyleConfig:
     scale: float = 1.0
     """Size of the pattern on the result: 2 makes its features twice as large."""
     scale_by: str = "area"
-    """What ``scale`` 1 means. ``area``: the result carries as many features as the style mesh, since
-    lengths are compared by the square roots of the surfaces; ``field.sigma`` and ``field.bound`` then
-    go with the pattern, too. ``frame``: both meshes fill the unit sphere, as in the paper."""
+    """What ``scale`` 1 means. ``area``: the result carries as many features as the style mesh, as
+    lengths go by the square root of the surface; ``field.sigma`` and ``field.bound`` then go with
+    the pattern, too. ``frame``: both meshes fill the unit sphere, as in the paper."""
     image_contrast: float | None = 0.12
     """Image styles: standard deviation that the picture's tone is brought to (it sets the height of
     the relief); null keeps the picture's own contrast."""
@@ -67,8 +67,9 @@ class FieldConfig:
     width: int = 256
     depth: int = 8
     """Fully connected layers, the output layer included."""
-    bound: float = 0.1
-    """Displacements lie in (-bound, bound), in radii; see ``style.scale_by``."""
+    bound: float | None = None
+    """Displacements lie in (-bound, bound), in radii; see ``style.scale_by``. null: what the style
+    mesh's own relief needs, and 0.05 for an image. The paper has 0.1."""
     zero_mean: bool = True
     """Subtract the area-weighted mean displacement, so that the mesh can't shrink as a whole."""
 
@@ -127,6 +128,9 @@ class ShadingConfig:
     """``flat`` or ``smooth``."""
     background: str = "foreground"
     """``white``, ``black``, ``foreground`` (the mean grey of the rendered source) or a number."""
+    outlines: bool = False
+    """Whether outlines carry gradients, where the renderer can. Off in the paper; where they do, the
+    optimiser grows knobs to make outlines inside the frame."""
     light_spread: float = 0.0
     """Largest angle, in degrees, by which the light is turned at random about the viewing axis, for
     every view anew; 0 fixes it in camera space. At 180 bumps can't be told from dents."""
@@ -242,7 +246,6 @@ POSITIVE = (
     "field.sigma",
     "field.features",
     "field.width",
-    "field.bound",
     "views.count",
     "views.distance",
     "views.local.per_view",
@@ -260,6 +263,7 @@ POSITIVE = (
 BETWEEN = {
     "source.remesh": (100, 10_000_000),
     "style.image_contrast": (0.0, 0.5),
+    "field.bound": (1e-4, 1.0),
     "field.depth": (2, 64),
     "field.progressive": (0.0, 1.0),
     "views.resolution": (32, 4096),

@@ -49,12 +49,15 @@ class FourierFeatures(nn.Module):
 class DisplacementField(nn.Module):
     """MLP from a position to its displacement along the normal, in (-bound, bound).
 
-    The last layer starts at zero, so that the generated mesh is the source mesh at step 0.
+    The last layer starts at zero, so that the generated mesh is the source mesh at step 0. ``unit``
+    is the length in which ``sigma`` counts its cycles.
     """
 
-    def __init__(self, config: FieldConfig, generator: torch.Generator, unit: float = 1.0):
+    def __init__(
+        self, config: FieldConfig, generator: torch.Generator, bound: float, unit: float = 1.0
+    ):
         super().__init__()
-        self.bound = config.bound * unit
+        self.bound = bound
         self.encode = FourierFeatures(
             config.features, config.sigma / unit, config.include_input, generator
         )

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 from styleexp import meshes
 from styleexp.renderers.base import Shading
 from styleexp.renderers.soft_raster import SoftRaster
-from styleexp.views import orbit
+from styleexp.views import orbit, zoom
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -41,14 +41,18 @@ def render_views(
     azimuths: list[float],
     size: int,
 ) -> np.ndarray:
-    """Pictures (views, size, size), 8-bit grey, of a mesh already in the unit sphere."""
+    """Pictures (views, size, size), 8-bit grey, of a mesh in the unit sphere; it fills the frame."""
     shading = Shading(albedo=0.8, ambient=0.22, light=LIGHT, background=1.0, normals="smooth")
     radians = math.pi / 180
-    cameras = orbit(torch.tensor(elevations) * radians, torch.tensor(azimuths) * radians, 2.6, 46.0)
+    cameras = orbit(torch.tensor(elevations) * radians, torch.tensor(azimuths) * radians, 3.0, 40.0)
+    points = torch.from_numpy(np.ascontiguousarray(vertices)).float()
+    seen = torch.einsum("nij,vj->nvi", cameras.rotation, points) + cameras.translation[:, None]
+    reach = (cameras.focal[:, None] * seen[..., :2] / -seen[..., 2:]).abs().max()
+    cameras = zoom(cameras, 0.94 / float(reach))
     large = size * SUPERSAMPLING
     with torch.no_grad():
         out = SoftRaster().render(
-            torch.from_numpy(np.ascontiguousarray(vertices)).float(),
+            points,
             torch.from_numpy(np.ascontiguousarray(faces)),
             cameras,
             shading,

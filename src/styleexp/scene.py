@@ -15,6 +15,7 @@ from styleexp.errors import UserError
 from styleexp.geometry import Surface, vertex_areas
 from styleexp.losses import StyleLoss
 from styleexp.registry import build
+from styleexp.relief import relief_height
 from styleexp.renderers.base import Shading
 from styleexp.renderers.specs import RENDERERS
 from styleexp.sources import load_source, load_style
@@ -26,9 +27,13 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
-    from styleexp.config import Config, StyleConfig
+    from styleexp.config import Config, FieldConfig, StyleConfig
     from styleexp.renderers.base import Renderer
     from styleexp.styles import StyleTarget
+
+
+BOUND_MARGIN = 1.2
+"""How much farther than the style's own relief the displacement may reach."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +49,8 @@ class Scene:
     areas: Float[Tensor, " vertices"]
     unit: float
     """Radii of the normalised source in which ``field.sigma`` and ``field.bound`` are given."""
+    bound: float
+    """Displacements lie in (-bound, bound), in radii of the normalised source."""
     viewer: Viewer
     loss: StyleLoss
     target: StyleTarget
@@ -92,6 +99,7 @@ def prepare(config: Config) -> Scene:
             target = styles.FixedTarget(loss, styles.image_bank(picture, config, unit))
     if config.style.scale_by == "frame":
         unit = 1.0
+    notes += too_coarse(source, unit / config.field.sigma)
     goal, own = target(0), styles.mesh_target(loss, viewer, surface.vertices)(0)
     return Scene(
         config=config,
@@ -101,6 +109,7 @@ def prepare(config: Config) -> Scene:
         surface=surface,
         areas=vertex_areas(surface),
         unit=unit,
+        bound=unit * choose_bound(config.field, style),
         viewer=viewer,
         loss=loss,
         target=target,
@@ -119,6 +128,31 @@ def pattern_unit(config: StyleConfig, source: meshes.Mesh, style: meshes.Mesh | 
     sphere = math.sqrt(4 * math.pi)
     unit = 1.0 if style is None else normalised_size(style) / sphere
     return config.scale * normalised_size(source) / sphere / unit
+
+
+def choose_bound(config: FieldConfig, style: meshes.Mesh | np.ndarray) -> float:
+    """The displacement's bound in the style's own radii: see ``FieldConfig.bound``."""
+    if config.bound is not None:
+        return config.bound
+    if not isinstance(style, meshes.Mesh):
+        return 0.05
+    vertices = meshes.normalisation(style.vertices).apply(style.vertices)
+    normals = meshes.vertex_normals(vertices, style.faces)
+    height = relief_height(vertices, style.faces, normals, length=0.5)
+    return min(max(BOUND_MARGIN * height, 0.01), 0.1)
+
+
+def too_coarse(mesh: meshes.Mesh, wavelength: float) -> list[str]:
+    """A note where the mesh's edges can't carry details of this size, in radii."""
+    edge = meshes.mean_edge_length(mesh.vertices, mesh.faces)
+    edge /= meshes.normalisation(mesh.vertices).scale
+    if edge <= wavelength / 3:
+        return []
+    enough = int(len(mesh.vertices) * (4 * edge / wavelength) ** 2)
+    return [
+        f"'{mesh.name}' is coarse for this style: its edges are {edge:.3f} radii long, the style's "
+        f"details about {wavelength:.3f}; source.remesh={round(enough, -3)} would carry them."
+    ]
 
 
 def normalised_size(mesh: meshes.Mesh) -> float:
@@ -160,6 +194,7 @@ def choose_shading(config: Config, grey: float) -> Shading:
     return Shading(
         albedo=config.shading.albedo,
         normals=config.shading.normals,
+        outlines=config.shading.outlines,
         background=named[background] if background in named else float(background),
     )
 

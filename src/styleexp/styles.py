@@ -71,9 +71,9 @@ def image_bank(
 ) -> Iterator[tuple[Images, Images]]:
     """Windows of a style picture with the texel density that the views of the result have.
 
-    The picture's longer side spans ``image_tile * unit`` radii of the source; it is mirrored at its
-    borders where a view is wider. Each batch holds ``count`` global and ``count * per_view`` local
-    windows at random places.
+    The picture's longer side spans ``image_tile * unit`` radii of the source; it is mirrored at
+    its borders where a view is wider. Each batch holds ``count`` global and ``count * per_view``
+    local windows at random places.
     """
     views_, local = config.views, config.views.local
     span = config.style.image_tile * unit

@@ -75,7 +75,8 @@ def stylize(source: str | Path, style: str | Path, *overrides: str) -> Result:
 
     Both are names or files (what has a suffix or a folder is a file). ``overrides`` are those of
     the command line: ``stylize("my.obj", "bubble", "profile=fast", "field.sigma=3")``. Writes
-    nothing; ``save`` of what it returns does. Raises `UserError` for what the command line would report.
+    nothing; ``save`` of what it returns does. Raises `UserError` for what the command line would
+    report.
     """
     config = compose(overrides)
     for part, what in ((config.source, source), (config.style, style)):
@@ -92,7 +93,9 @@ def start(scene: Scene) -> State:
     """The state before the first step: M = C."""
     optim = scene.config.optim
     generator = step_generator(optim.seed, 0, stream=7)
-    displacement_field = DisplacementField(scene.config.field, generator, scene.unit)
+    displacement_field = DisplacementField(
+        scene.config.field, generator, scene.bound, scene.unit
+    )
     displacement_field.to(scene.surface.vertices.device)
     adam = torch.optim.Adam(displacement_field.parameters(), lr=optim.rate)
     return State(displacement_field, adam)

@@ -13,8 +13,8 @@ Coordinates, once and for all backends::
         from +X               along -Z                                     (c + 0.5, r + 0.5)
 
 A point ``p`` in the world is at ``q = R p + t`` in the camera and at ``x = focal_x q.x / -q.z +
-center_x``, ``y = focal_y q.y / -q.z + center_y`` in NDC. ``w = -q.z`` is its depth, positive in front
-of the camera. Faces wind counter-clockwise seen from outside; back faces are culled.
+center_x``, ``y = focal_y q.y / -q.z + center_y`` in NDC. ``w = -q.z`` is its depth, positive in
+front of the camera. Faces wind counter-clockwise seen from outside; back faces are culled.
 """
 
 from __future__ import annotations
@@ -70,6 +70,9 @@ class Shading:
     background: float = 1.0
     normals: str = "flat"
     """``flat`` (one normal a face) or ``smooth`` (area-weighted vertex normals, interpolated)."""
+    outlines: bool = True
+    """Whether backends that can differentiate visibility do: outlines are then anti-aliased and pull
+    on the vertices. Without, outlines are hard and gradients are those of shading alone."""
 
 
 @dataclass(frozen=True)

@@ -82,7 +82,7 @@ class SoftRaster(Renderer):
         image = background.index_copy(0, visible.pixel, intensities)
         coverage = (visible.face_ids >= 0).to(vertices.dtype).view(-1)
 
-        if self.visibility_gradient == "contour":
+        if self.visibility_gradient == "contour" and shading.outlines:
             across = self._neighbours(faces, vertices.shape[0])
             edges = find_crossings(points, corners, across, front, pairs, visible, cameras.near)
             distance = CrossingDistance.apply(points, edges)

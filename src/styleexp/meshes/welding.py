@@ -10,9 +10,6 @@ import trimesh
 from styleexp.errors import UserError
 from styleexp.meshes.mesh import Carrier, Mesh, face_areas
 
-# Beyond this squares of coordinates overflow a double.
-_LARGEST = 1e100
-_SMALLEST = 1e-100
 # Points nearer to each other than this share of the extent are one vertex. It forgives the rounding
 # of a node's transform (1e-16), and is far below what float32 files can tell apart (6e-8).
 _WELD = 1e-9
@@ -49,12 +46,10 @@ def weld(name: str, points: np.ndarray, carrier: Carrier, notes: list[str]) -> M
             f"has {number} with NaN or infinite coordinates: repair it in a mesh editor."
         )
     extent = float(np.ptp(points, axis=0).max())
-    if np.abs(points).max() > _LARGEST:
-        raise UserError(f"has coordinates beyond {_LARGEST:g}: scale the mesh down.")
     if extent <= 0.0:
         raise UserError("has no extent, all its vertices coincide: export it again, uncompressed.")
-    if extent < _SMALLEST:
-        raise UserError(f"is smaller than {_SMALLEST:g}: scale the mesh up.")
+    if not 1e-100 < extent < 1e100:  # beyond, squares of coordinates vanish or overflow
+        raise UserError(f"measures {extent:g}, too little or too much: scale the mesh.")
     if np.abs(points).max() > 1e3 * extent:
         notes.append("lies far from the origin, where PLY and GLB round coordinates; OBJ does not")
 
@@ -88,7 +83,9 @@ def _inside_out(points: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.n
     """
     n = len(faces)
     mesh = trimesh.Trimesh(points, faces, process=False)
-    (f, g), shared = mesh.face_adjacency.T, mesh.face_adjacency_edges
+    point_like = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    sound = ~point_like[mesh.face_adjacency].any(axis=1)
+    (f, g), shared = mesh.face_adjacency[sound].T, mesh.face_adjacency_edges[sound]
 
     def forward(face: np.ndarray) -> np.ndarray:
         at = (faces[face] == shared[:, :1]).argmax(axis=1)
@@ -112,7 +109,7 @@ def _inside_out(points: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.n
         notes.append(f"turned {number} that disagreed with their neighbours{remark}")
 
     agreed = np.where(flipped[:, None], faces[:, ::-1], faces)
-    mesh = trimesh.Trimesh(points, agreed, process=False)
+    mesh = trimesh.Trimesh(points, agreed.copy(), process=False)
     trimesh.repair.fix_inversion(mesh, multibody=True)
     inward = (mesh.faces != agreed).any(axis=1)
     if inward.any():

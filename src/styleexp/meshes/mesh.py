@@ -29,7 +29,7 @@ class Carrier:
     uv: Float[np.ndarray, "rows 2"] | None = None
     """v points up, as in OBJ and PLY; glTF's points down."""
     normals: Float[np.ndarray, "rows 3"] | None = None
-    """The file's normals: they say which corners are smooth together, not where they point now."""
+    """A glTF file's: they say which corners are smooth together, not where they point now."""
     colors: UInt8[np.ndarray, "rows 4"] | None = None
     parts: tuple[str, ...] = ("mesh",)
     face_part: Int[np.ndarray, " faces"] | None = None

@@ -20,33 +20,17 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-from styleexp.meshes.mesh import (
-    Carrier,
-    Mesh,
-    Normalisation,
-    face_areas,
-    mean_edge_length,
-    normalisation,
-    vertex_normals,
-)
+from styleexp.meshes.mesh import Mesh as Mesh
+from styleexp.meshes.mesh import Normalisation as Normalisation
+from styleexp.meshes.mesh import face_areas as face_areas
+from styleexp.meshes.mesh import mean_edge_length as mean_edge_length
+from styleexp.meshes.mesh import normalisation as normalisation
+from styleexp.meshes.mesh import vertex_normals as vertex_normals
 
 if TYPE_CHECKING:
-    from styleexp.meshes.reading import load_mesh
-    from styleexp.meshes.remeshing import remesh
-    from styleexp.meshes.writing import save_mesh
-
-__all__ = [
-    "Carrier",
-    "Mesh",
-    "Normalisation",
-    "face_areas",
-    "load_mesh",
-    "mean_edge_length",
-    "normalisation",
-    "remesh",
-    "save_mesh",
-    "vertex_normals",
-]
+    from styleexp.meshes.reading import load_mesh as load_mesh
+    from styleexp.meshes.remeshing import remesh as remesh
+    from styleexp.meshes.writing import save_mesh as save_mesh
 
 # These need trimesh, which is loaded when the first of them is used.
 _HOMES = {"load_mesh": "reading", "remesh": "remeshing", "save_mesh": "writing"}

@@ -1,0 +1,217 @@
+"""OBJ files. trimesh would group the faces by material; here they stay in the file's order.
+
+Their normals are not read: most are those of the faces of a smooth surface, and would facet it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from styleexp.errors import UserError
+from styleexp.meshes.mesh import Carrier
+from styleexp.meshes.welding import check_indices, plural
+
+# A line of an MTL file that names an image, after options such as ``-s 1 1 1`` or ``-bm 0.5``.
+MAP = re.compile(
+    r"^(\s*(?:map_\w+|bump|disp|decal|refl|norm)\s+"
+    r"(?:-[a-z]+(?:\s+(?:on|off|[-+.\d][-+.\de]*|[rgbmlz](?=\s)|sphere))*\s+)*)(\S.*?)\s*$",
+    re.IGNORECASE | re.MULTILINE,
+)
+
+
+def read_obj(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
+    """The rows' positions, all else, and notes."""
+    tables: dict[str, list[list[str]]] = {"v": [], "vt": []}
+    polygons: list[list[int]] = []  # v and vt of each corner in turn
+    polygon_part, polygon_material = [], []
+    parts: dict[str, int] = {}
+    materials: dict[str, int] = {}
+    libraries: list[str] = []
+    part, material = path.stem, -1
+
+    for number, line in enumerate(_text(data).replace("\\\n", " ").split("\n"), 1):
+        key, _, rest = line.strip().partition(" ")
+        rest = rest.strip()
+        if key in tables:
+            tables[key].append(rest.split("#")[0].split())
+        elif key == "f":
+            polygon = []
+            for word in rest.split("#")[0].split():
+                for given, table in zip(word.split("/"), tables.values(), strict=False):
+                    value = int(given or -len(table) - 1)  # -1 from 0 where there is none
+                    if value == 0:
+                        raise UserError(
+                            f"has index 0 in line {number}, but OBJ counts from 1: export it again."
+                        )
+                    polygon.append(value - 1 if value > 0 else len(table) + value)
+                polygon += [-1] * (len(polygon) % 2)
+            polygons.append(polygon)
+            polygon_part.append(parts.setdefault(part, len(parts)))
+            polygon_material.append(material)
+        elif key in ("o", "g"):
+            part = rest or path.stem
+        elif key == "usemtl":
+            material = materials.setdefault(rest, len(materials))
+        elif key == "mtllib":
+            libraries.append(rest)
+
+    notes: list[str] = []
+    positions, colors = _vertices(tables["v"])
+    counts = np.array([len(polygon) // 2 for polygon in polygons], dtype=np.int64)
+    index = np.array([i for polygon in polygons for i in polygon], dtype=np.int64).reshape(-1, 2)
+    check_indices(index[:, 0], len(positions))
+    corner, owner = triangulate(counts, positions[index[:, 0]], notes)
+    if len(counts) and not len(corner):
+        raise UserError("has no face with three corners: export the mesh again.")
+    if len(index) and index[:, 1].max() >= len(tables["vt"]):
+        notes.append("left out the texture coordinates: faces refer to some that do not exist")
+        index[:, 1] = -1
+
+    # A row is one combination of position and texture coordinate.
+    rows, inverse = np.unique(index[corner.ravel()], axis=0, return_inverse=True)
+    unused = len(positions) - len(np.unique(rows[:, 0]))
+    if unused and len(corner):
+        notes.append(f"left out {plural(unused, 'vertex', 'vertices')} that no face uses")
+    mtl, textures, known = _materials(path, libraries, notes)
+    carrier = Carrier(
+        inverse.reshape(-1, 3),
+        rows[:, 0],
+        np.zeros(len(corner), dtype=bool),
+        uv=_uv(tables["vt"], rows[:, 1]),
+        colors=None if colors is None else colors[rows[:, 0]],
+        parts=tuple(parts) or (path.stem,),
+        face_part=np.array(polygon_part, dtype=np.int64)[owner],
+        materials=tuple(known.get(name) or surface(name) for name in materials),
+        face_material=np.array(polygon_material, dtype=np.int64)[owner],
+        mtl=mtl,
+        textures=textures,
+    )
+    return positions[rows[:, 0]] if len(corner) else positions, carrier, notes
+
+
+def triangulate(
+    counts: np.ndarray, points: np.ndarray, notes: list[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles of polygons, in the polygons' order: fans, and quads cut along the inner diagonal.
+
+    ``counts`` (polygons,) and ``points`` (sum of counts, 3) are runs of corners. Returns triangles
+    (t, 3) into the corners and the polygon (t,) that each came from.
+    """
+    start = np.cumsum(counts) - counts
+    corner = np.arange(len(points))
+    quads = start[counts == 4, None] + np.arange(4)
+    a, b, c, d = (points[quads[:, k]] for k in range(4))
+    apart = np.einsum("ij,ij->i", np.cross(b - a, c - a), np.cross(c - a, d - a)) < 0
+    corner[quads[apart]] = np.roll(quads[apart], -1, axis=1)
+
+    triangles = np.maximum(counts - 2, 0)
+    owner = np.repeat(np.arange(len(counts)), triangles)
+    step = np.arange(len(owner)) - np.repeat(np.cumsum(triangles) - triangles, triangles)
+    fans = start[owner, None] + np.stack([np.zeros_like(step), step + 1, step + 2], axis=1)
+    if (small := int((counts < 3).sum())) > 0:
+        number = plural(small, "face", "faces")
+        notes.append(f"left out {number} with fewer than three corners")
+    if (large := int((counts > 3).sum())) > 0:
+        number = plural(large, "quad or larger polygon", "quads and larger polygons")
+        notes.append(f"triangulated {number}")
+    return corner[fans], owner
+
+
+def surface(name: str, image: Any = None, color: Any = None) -> Any:
+    """A matt material; ``color`` is red, green, blue, alpha in [0, 1]."""
+    return trimesh.visual.material.PBRMaterial(
+        name=name,
+        baseColorTexture=image,
+        baseColorFactor=color if color is not None else [1.0] * 4 if image else [0.8] * 3 + [1.0],
+        metallicFactor=0.0,
+        roughnessFactor=1.0,
+        alphaMode="BLEND" if color is not None and color[3] < 1.0 else None,
+    )
+
+
+def bare(name: str) -> str:
+    """The file's name without folders, be they written the Unix or the Windows way."""
+    return re.split(r"[/\\]", name)[-1]
+
+
+def _text(data: bytes) -> str:
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = data.decode("latin-1")
+    if "\0" in text:
+        raise UserError("is binary where text was expected: export the mesh again.")
+    return text.replace("\r\n", "\n").replace("\r", "\n").replace("\t", " ")
+
+
+def _vertices(lines: list[list[str]]) -> tuple[np.ndarray, np.ndarray | None]:
+    """Positions (n, 3), and 8-bit colours (n, 4) where every line gives ``x y z r g b``."""
+    shortest = min(map(len, lines), default=3)
+    if shortest < 3:
+        raise UserError("has a vertex with fewer than three coordinates: export it again.")
+    table = np.array([line[:6] if shortest >= 6 else line[:3] for line in lines], dtype=np.float64)
+    table = table.reshape(len(lines), -1) if lines else np.zeros((0, 3))
+    colors = table[:, 3:]
+    if not colors.size:
+        return table, None
+    bytes_ = np.clip(colors * (1.0 if colors.max() > 1.0 else 255.0), 0, 255).round()
+    return table[:, :3], np.insert(bytes_, 3, 255, axis=1).astype(np.uint8)
+
+
+def _uv(lines: list[list[str]], chosen: np.ndarray) -> np.ndarray | None:
+    """Texture coordinates (rows, 2), zero where a row has none; None if none has."""
+    if not (chosen >= 0).any():
+        return None
+    return np.array([[*line, "0", "0"][:2] for line in [*lines, []]], dtype=np.float64)[chosen]
+
+
+def _beside(path: Path, name: str) -> Path | None:
+    """The file that ``name`` in ``path`` refers to, if there is one.
+
+    Files made elsewhere often hold an absolute or a Windows path: then the bare name is tried.
+    """
+    for candidate in (name, name.replace("\\", "/"), bare(name)):
+        with contextlib.suppress(OSError, ValueError):
+            if candidate and (path.parent / candidate).is_file():
+                return path.parent / candidate
+    return None
+
+
+def _materials(
+    path: Path, libraries: list[str], notes: list[str]
+) -> tuple[str, dict[str, bytes], dict[str, Any]]:
+    """The libraries' text, the images they name, and the materials by name."""
+    texts: list[str] = []
+    textures: dict[str, bytes] = {}
+    for library in libraries:
+        # One line may name several libraries, or one whose name has spaces.
+        for name in [library] if _beside(path, library) else library.split():
+            file = _beside(path, name)
+            if file is None:
+                notes.append(f"did not find the material library '{name}', saved without it")
+                continue
+            texts.append(_text(file.read_bytes()))
+            for wanted in dict.fromkeys(match[2] for match in MAP.finditer(texts[-1])):
+                image = _beside(file, wanted)
+                if image is None:
+                    notes.append(f"did not find the texture '{wanted}', saved without it")
+                else:
+                    textures.setdefault(wanted, image.read_bytes())
+    text = "\n".join(texts)
+    plain = MAP.sub(lambda match: f"{match[1].split()[0]} {match[2]}", text)
+    known = {}
+    for name, found in trimesh.exchange.obj.parse_mtl(plain, resolver=textures).items():
+        color = np.append(np.resize(found.get("diffuse", 0.8), 3), 1.0)
+        with contextlib.suppress(ValueError):
+            color[3] = 1.0 - float(found["tr"][-1]) if "tr" in found else color[3]
+            color[3] = float(found["d"][-1]) if "d" in found else color[3]
+        if found.get("image"):
+            color[:3] = 1.0  # glTF multiplies the two, MTL viewers do not
+        known[name] = surface(name, found.get("image"), color)
+    return text, textures, known

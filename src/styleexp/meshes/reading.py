@@ -1,0 +1,206 @@
+"""Files to meshes: trimesh reads, and one sentence says what is wrong."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from styleexp.errors import UserError
+from styleexp.meshes.mesh import Carrier, Mesh
+from styleexp.meshes.obj import read_obj, surface
+from styleexp.meshes.welding import check_indices, plural, weld
+
+READABLE = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
+
+
+def load_mesh(path: str | os.PathLike[str]) -> Mesh:
+    """Load an OBJ, PLY, STL, OFF, GLB or glTF file as one welded triangle mesh.
+
+    Faces keep the file's order, quads and n-gons triangulated in place (but a PLY or OFF file that
+    mixes them gives its triangles first). Vertices at one position become one; vertices that no
+    face uses are left out. All geometries of a glTF scene are joined in world space. Parts whose
+    faces point inwards, or disagree among themselves, are turned for the optimisation and saved
+    with the file's own winding. Open, non-manifold and multi-component meshes are accepted,
+    degenerate faces are kept.
+
+    Raises `UserError`, one sentence with the file's name and a remedy, for anything that is not a
+    mesh with a surface.
+    """
+    path = Path(path)
+    kind = path.suffix.lower()
+    if path.is_dir():
+        raise UserError(f"'{path}' is a folder: give a mesh file ({', '.join(READABLE)}).")
+    if kind not in READABLE:
+        what = f"ends in '{path.suffix}'" if path.suffix else "has no extension"
+        raise UserError(f"'{path}' {what}: supported mesh files are {', '.join(READABLE)}.")
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise UserError(f"'{path}' does not exist: check the path of the mesh.") from None
+    except PermissionError:
+        raise UserError(f"'{path}' may not be read: change the file's permissions.") from None
+    except OSError as error:
+        raise UserError(f"'{path}' cannot be read ({error.strerror or error}).") from None
+    if not data.strip():
+        raise UserError(f"'{path}' is empty: export the mesh again.")
+    try:
+        # Junk may hold numbers that overflow on the way; `weld` speaks about them.
+        with np.errstate(all="ignore"):
+            points, carrier, notes = (read_obj if kind == ".obj" else _read)(data, path)
+        return weld(path.stem, points, carrier, notes)
+    except UserError as error:
+        raise UserError(f"'{path}' {error}") from None
+    except (MemoryError, KeyboardInterrupt):
+        raise
+    except Exception as error:
+        detail = " ".join(str(error).split())[:120]
+        remedy = "as OBJ, or with triangles only" if kind == ".ply" else "with all files it needs"
+        raise UserError(
+            f"'{path}' is not a readable {kind[1:].upper()} file "
+            f"({type(error).__name__}: {detail}): export the mesh again, {remedy}."
+        ) from None
+
+
+def _read(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
+    """The rows' positions, all else, and notes, of a format that trimesh reads."""
+    kind = path.suffix.lower()[1:]
+    scene = trimesh.load_scene(
+        io.BytesIO(data),
+        file_type=kind,
+        resolver=trimesh.resolvers.FilePathResolver(str(path.absolute())),
+        process=False,
+    )
+    notes: list[str] = []
+    gltf = kind in ("glb", "gltf")
+    nodes = _own_geometries(scene)
+    if len(nodes) < len(scene.graph.nodes_geometry):
+        notes.append("left out what has no faces")
+    if not nodes:
+        nothing = np.zeros((0, 3), dtype=np.int64)
+        points = [nothing, *(each.vertices for each in scene.geometry.values())]
+        return np.concatenate(points), Carrier(nothing, nothing, nothing), notes
+
+    unused, lengths = 0, [0]
+    parts: dict[str, int] = {}
+    columns: dict[str, list[Any]] = defaultdict(list)
+    materials: dict[int, tuple[int, Any]] = {}
+    for node in nodes:
+        matrix, name = scene.graph[node]
+        shape = scene.geometry[name]
+        check_indices(shape.faces, len(shape.vertices))
+        if len(shape.faces) < _declared_faces(kind, data, shape):
+            raise UserError("ends too early: export the mesh again.")
+        if kind in ("ply", "off"):
+            shape.faces = _in_file_order(np.asarray(shape.faces))
+        unused += len(shape.vertices)
+        shape.remove_unreferenced_vertices()
+        unused -= len(shape.vertices)
+
+        # The specification: a mirrored node winds the other way.
+        faces = shape.faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else shape.faces
+        part = node if gltf or len(nodes) > 1 else path.stem
+        if shape.metadata.get("from_gltf_primitive"):
+            part = scene.graph.transforms.parents[node]
+        number, material = -1, _material(shape.visual)
+        if material is not None:
+            number, _ = materials.setdefault(hash(material), (len(materials), material))
+        normals = shape.vertex_normals @ np.linalg.pinv(matrix[:3, :3]) if gltf else None
+        for column, values in (
+            ("points", trimesh.transform_points(shape.vertices, matrix)),
+            ("corners", faces + sum(lengths)),
+            ("uv", getattr(shape.visual, "uv", None)),
+            ("normals", normals),
+            ("colors", _colors(shape.visual)),
+            ("part", np.full(len(faces), parts.setdefault(part, len(parts)))),
+            ("material", np.full(len(faces), number)),
+        ):
+            columns[column].append(values)
+        lengths.append(len(shape.vertices))
+
+    if unused:
+        notes.append(f"left out {plural(unused, 'vertex', 'vertices')} that no face uses")
+    corners = np.concatenate(columns["corners"])
+    carrier = Carrier(
+        corners,
+        np.zeros(sum(lengths), dtype=np.int64),
+        np.zeros(len(corners), dtype=bool),
+        uv=_joined(columns["uv"], lengths[1:], np.zeros(2)),
+        normals=_joined(columns["normals"], lengths[1:], np.zeros(3)),
+        colors=_joined(columns["colors"], lengths[1:], np.full(4, 255, dtype=np.uint8)),
+        parts=tuple(parts),
+        face_part=np.concatenate(columns["part"]),
+        materials=tuple(material for _, material in materials.values()),
+        face_material=np.concatenate(columns["material"]),
+        scene=scene if gltf else None,
+    )
+    return np.concatenate(columns["points"]), carrier, notes
+
+
+def _declared_faces(kind: str, data: bytes, shape: trimesh.Trimesh) -> int:
+    """How many a PLY or OFF file promises: trimesh takes what there is of a file cut off."""
+    if kind == "ply":
+        return shape.metadata["_ply_raw"]["face"]["length"]
+    counts = re.search(rb"^(?:OFF)?[ \t]*\d+[ \t]+(\d+)", data, re.MULTILINE)
+    return int(counts[1]) if kind == "off" and counts else 0
+
+
+def _own_geometries(scene: trimesh.Scene) -> list[str]:
+    """The nodes that show a surface, in the order of the file's meshes, each given its own copy."""
+    position = {name: k for k, name in enumerate(scene.geometry)}
+    parents = scene.graph.transforms.parents
+    nodes = sorted(scene.graph.nodes_geometry, key=lambda node: position[scene.graph[node][1]])
+    shapes: dict[str, Any] = {}
+    for node in nodes:
+        matrix, name = scene.graph.get(node, frame_from=parents[node])
+        shape = scene.geometry[name]
+        if name in shapes:
+            shape = shape.copy(include_cache=True)
+            name = trimesh.util.unique_name(name, {*scene.geometry, *shapes})
+            scene.graph.update(node, frame_from=parents[node], matrix=matrix, geometry=name)
+        shapes[name] = shape
+    scene.geometry.clear()
+    scene.geometry.update(shapes)
+    return [
+        node for node in nodes if len(getattr(scene.geometry[scene.graph[node][1]], "faces", ()))
+    ]
+
+
+def _in_file_order(faces: np.ndarray) -> np.ndarray:
+    """trimesh gives the first halves of all quads, then the second ones: bring them together."""
+    first, second = faces[: len(faces) // 2], faces[len(faces) // 2 :]
+    if len(first) == len(second) and (first[:, [2, 0]] == second[:, [0, 2]]).all():
+        return np.stack([first, second], axis=1).reshape(-1, 3)
+    return faces
+
+
+def _colors(visual: Any) -> np.ndarray | None:
+    if visual.kind == "texture":
+        colors = visual.vertex_attributes.get("color")
+    else:
+        colors = visual.vertex_colors if visual.kind in ("vertex", "face") else None
+    return None if colors is None else trimesh.visual.color.to_rgba(colors)
+
+
+def _material(visual: Any) -> Any:
+    material = getattr(visual, "material", None)
+    if isinstance(material, trimesh.visual.material.SimpleMaterial):  # what a PLY file has
+        return surface("material", material.image) if material.image else None
+    return material
+
+
+def _joined(columns: list[Any], lengths: list[int], filler: np.ndarray) -> np.ndarray | None:
+    """One column of all rows, filled where a part has none; None if no part has it."""
+    if all(each is None for each in columns):
+        return None
+    filled: list[np.ndarray] = [
+        np.tile(filler, (length, 1)) if each is None else each
+        for each, length in zip(columns, lengths, strict=True)
+    ]
+    return np.concatenate(filled)
