@@ -32,7 +32,7 @@ def complaint(done):
     """The one line on standard error of a refused command."""
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
-    lines = [line for line in done.stderr.splitlines() if line.strip()]
+    lines = [x for x in done.stderr.splitlines() if x.strip() and not x.startswith("warning: ")]
     assert len(lines) == 1, done.stderr
     return lines[0]
 
@@ -242,3 +242,22 @@ def test_shell_completion_knows_the_choices(tmp_path):
         "-sc", "query=bash", cwd=tmp_path, env={**os.environ, "COMP_LINE": "styleexp style=bub"}
     )
     assert "style=bubble" in done.stdout
+
+
+def test_several_values_are_a_sweep_and_a_failed_job_does_not_stop_the_rest(tmp_path):
+    done = command(
+        "-m", "source=torus", "style.path=none.obj,there.ply", *SMOKE, "hydra.sweep.dir=all",
+        cwd=with_style(tmp_path),
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert "none.obj" in done.stderr
+    states = [json.loads((tmp_path / f"all/{n}/status.json").read_text()) for n in (0, 1)]
+    assert [s["status"] for s in states] == ["failed", "done"]
+
+
+def with_style(folder):
+    from styleexp import meshes, shapes
+
+    style = shapes.make("stripe", detail=2000)
+    meshes.save_mesh(style, style.vertices, folder / "there.ply")
+    return folder

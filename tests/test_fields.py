@@ -36,7 +36,7 @@ def test_progressive_opening_goes_from_low_to_high_frequencies():
 
 
 def test_starts_at_the_source_and_keeps_its_bound():
-    field = DisplacementField(FieldConfig(), generator(), 0.1)
+    field = DisplacementField(FieldConfig(), generator(), 5.0, 0.1)
     encoded = field.encode(torch.rand(50, 3))
     assert (field(encoded) == 0).all()
     torch.nn.init.constant_(field.last.bias, 1e3)
@@ -44,14 +44,14 @@ def test_starts_at_the_source_and_keeps_its_bound():
 
 
 def test_paper_sizes():
-    field = DisplacementField(FieldConfig(), generator(), 0.1)
+    field = DisplacementField(FieldConfig(), generator(), 5.0, 0.1)
     shapes = [tuple(layer.weight.shape) for layer in (*field.hidden, field.last)]
     assert shapes == [(256, 256)] * 7 + [(1, 256)]
 
 
 def test_equal_generators_make_equal_fields_and_others_do_not():
     def weights(seed):
-        return DisplacementField(FieldConfig(), generator(seed), 0.1).hidden[0].weight
+        return DisplacementField(FieldConfig(), generator(seed), 5.0, 0.1).hidden[0].weight
 
     assert torch.equal(weights(1), weights(1))
     assert not torch.equal(weights(1), weights(2))

@@ -46,8 +46,8 @@ class StyleConfig:
     image_match_mean: bool = True
     """Image styles: shift the picture's mean tone to the mean of the rendered source."""
     image_tile: float = 1.0
-    """Image styles: what the picture's longer side spans on the result, in radii: the source's own
-    (``scale_by=frame``) or those of the sphere with the source's surface (``area``)."""
+    """Image styles: how large the picture lies on the result, besides ``scale``. At 1 a square
+    picture has the area of the source's surface (``scale_by=area``) or of the unit sphere's."""
 
 
 @dataclass
@@ -55,9 +55,10 @@ class FieldConfig:
     """The displacement field: an MLP on Fourier features (Sec. 3.2, Eq. 1)."""
 
     name: str = "fourier_mlp"
-    sigma: float = 5.0
+    sigma: float | None = None
     """Standard deviation of the frequency matrix B (Fig. 7), in cycles per radius; see
-    ``style.scale_by``."""
+    ``style.scale_by``. null: the root mean square frequency of the style mesh's relief, or of the
+    picture's tone. The paper has 5."""
     features: int = 128
     """Rows of B; the encoding has twice as many entries (h_f = 256)."""
     include_input: bool = False
@@ -69,7 +70,7 @@ class FieldConfig:
     """Fully connected layers, the output layer included."""
     bound: float | None = None
     """Displacements lie in (-bound, bound), in radii; see ``style.scale_by``. null: what the style
-    mesh's own relief needs, and 0.05 for an image. The paper has 0.1."""
+    mesh's own relief needs, and 0.05 for a picture. The paper has 0.1."""
     zero_mean: bool = True
     """Subtract the area-weighted mean displacement, so that the mesh can't shrink as a whole."""
 
@@ -129,8 +130,8 @@ class ShadingConfig:
     background: str = "foreground"
     """``white``, ``black``, ``foreground`` (the mean grey of the rendered source) or a number."""
     outlines: bool = False
-    """Whether outlines carry gradients, where the renderer can. Off in the paper; where they do, the
-    optimiser grows knobs to make outlines inside the frame."""
+    """Whether outlines carry gradients, where the renderer can. Off in the paper; where they do,
+    the optimiser grows knobs to make outlines inside the frame."""
     light_spread: float = 0.0
     """Largest angle, in degrees, by which the light is turned at random about the viewing axis, for
     every view anew; 0 fixes it in camera space. At 180 bumps can't be told from dents."""
@@ -157,7 +158,7 @@ class LossConfig:
         default_factory=lambda: ["conv1_1", "conv2_1", "conv3_1", "conv4_1", "conv5_1"]
     )
     """Style layers, by name or by the paper's 1-based index of VGG-19's convolutions."""
-    block_weights: list[float] = option(default_factory=lambda: [1.0, 1.0, 1.0, 1.0, 1.0])
+    block_weights: list[float] = option(default_factory=lambda: [0.3, 0.5, 1.0, 2.0, 2.0])
     """A weight for the layers of each of VGG's five blocks."""
     lambda_global: float = 0.3
     lambda_local: float = 1.0
@@ -243,7 +244,6 @@ CHOICES = {
 POSITIVE = (
     "style.scale",
     "style.image_tile",
-    "field.sigma",
     "field.features",
     "field.width",
     "views.count",
@@ -263,6 +263,7 @@ POSITIVE = (
 BETWEEN = {
     "source.remesh": (100, 10_000_000),
     "style.image_contrast": (0.0, 0.5),
+    "field.sigma": (1e-3, 1e3),
     "field.bound": (1e-4, 1.0),
     "field.depth": (2, 64),
     "field.progressive": (0.0, 1.0),

@@ -49,18 +49,14 @@ class FourierFeatures(nn.Module):
 class DisplacementField(nn.Module):
     """MLP from a position to its displacement along the normal, in (-bound, bound).
 
-    The last layer starts at zero, so that the generated mesh is the source mesh at step 0. ``unit``
-    is the length in which ``sigma`` counts its cycles.
+    The last layer starts at zero, so that the generated mesh is the source mesh at step 0.
+    ``sigma`` is in cycles per radius of the normalised source, ``bound`` in such radii.
     """
 
-    def __init__(
-        self, config: FieldConfig, generator: torch.Generator, bound: float, unit: float = 1.0
-    ):
+    def __init__(self, config: FieldConfig, generator: torch.Generator, sigma: float, bound: float):
         super().__init__()
         self.bound = bound
-        self.encode = FourierFeatures(
-            config.features, config.sigma / unit, config.include_input, generator
-        )
+        self.encode = FourierFeatures(config.features, sigma, config.include_input, generator)
         sizes = [self.encode.size] + [config.width] * (config.depth - 1) + [1]
         linears = [nn.Linear(a, b) for a, b in itertools.pairwise(sizes)]
         for layer in linears:  # torch's default initialisation, from our own generator

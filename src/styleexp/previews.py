@@ -41,7 +41,7 @@ def render_views(
     azimuths: list[float],
     size: int,
 ) -> np.ndarray:
-    """Pictures (views, size, size), 8-bit grey, of a mesh in the unit sphere; it fills the frame."""
+    """Pictures (views, size, size), 8-bit grey, of a mesh in the unit sphere, framed tightly."""
     shading = Shading(albedo=0.8, ambient=0.22, light=LIGHT, background=1.0, normals="smooth")
     radians = math.pi / 180
     cameras = orbit(torch.tensor(elevations) * radians, torch.tensor(azimuths) * radians, 3.0, 40.0)

@@ -86,17 +86,16 @@ class RunFolder:
 
     def save_checkpoint(self, state: State) -> None:
         """Field, optimiser and step in one safetensors file; the one before is kept beside it."""
-        from safetensors.torch import save_file
+        from safetensors.torch import save
 
         tensors = {f"field.{k}": v.contiguous() for k, v in state.field.state_dict().items()}
         for index, slots in state.optimizer.state_dict()["state"].items():
             tensors |= {f"adam.{index}.{k}": v.contiguous() for k, v in slots.items()}
+        metadata = {"schema": str(SCHEMA), "step": str(state.step)}
+        content = save(tensors, metadata=metadata)
         if self.checkpoint.exists():
             os.replace(self.checkpoint, self.path / "checkpoint.previous.safetensors")
-        metadata = {"schema": str(SCHEMA), "step": str(state.step)}
-        self.write(
-            "checkpoint.safetensors", lambda path: save_file(tensors, path, metadata=metadata)
-        )
+        self.write("checkpoint.safetensors", lambda path: path.write_bytes(content))
 
     def load_checkpoint(self, state: State) -> str | None:
         """Bring ``state`` to the latest readable checkpoint; returns what to tell the user.

@@ -1,4 +1,4 @@
-"""How high a mesh's relief is, without any neural network."""
+"""How high and how fine a mesh's or a picture's relief is, without any neural network."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 
-def relief_height(
+def mesh_relief(
     vertices: Float[np.ndarray, "vertices 3"],
     faces: Int[np.ndarray, "faces 3"],
     normals: Float[np.ndarray, "vertices 3"],
     length: float,
-) -> float:
-    """Half the range (1st to 99th percentile) of the mesh over its own smoothed version.
+) -> Float[np.ndarray, " vertices"]:
+    """Height of each vertex over the mesh's own smoothed version, along its normal.
 
     Smoothing is one implicit step of the graph Laplacian that flattens what is smaller than about
-    ``length``, in the units of ``vertices``. The height is measured along the normals.
+    ``length``, in the units of ``vertices``. The heights' mean is zero.
     """
     from scipy.sparse import coo_matrix, diags, identity
     from scipy.sparse.linalg import splu
@@ -35,7 +35,45 @@ def relief_height(
     # On an even mesh the graph Laplacian is about 3/2 edge^2 times the true one, whose eigenvalue
     # for a wave of ``length`` is (2 pi / length)^2: such a wave is damped to a fifth.
     time = 4 * (length / (2 * np.pi * edge)) ** 2 / 1.5
-    smooth = splu((identity(count) + time * laplacian).tocsc()).solve(np.ascontiguousarray(vertices))
+    smooth = splu((identity(count) + time * laplacian).tocsc()).solve(
+        np.ascontiguousarray(vertices)
+    )
     height = ((vertices - smooth) * normals).sum(axis=1)
+    return height - height.mean()
+
+
+def half_range(height: Float[np.ndarray, " vertices"]) -> float:
+    """Half of the distance from the 1st to the 99th percentile."""
     low, high = np.percentile(height, [1, 99])
     return float(high - low) / 2
+
+
+def mesh_frequency(
+    height: Float[np.ndarray, " vertices"],
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+) -> float:
+    """Cycles per unit length of a height on a mesh: the root mean square slope over the root mean
+    square height, which for a sine wave is 2 pi times its frequency."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    cross = np.cross(b - a, c - a)
+    double = np.linalg.norm(cross, axis=1).clip(min=1e-30)
+    normal = cross / double[:, None]
+    ha, hb, hc = (height[faces[:, i]][:, None] for i in range(3))
+    # Gradient of a linear function on a triangle.
+    rotated = ha * (c - b) + hb * (a - c) + hc * (b - a)
+    slope = np.linalg.norm(np.cross(normal, rotated), axis=1) / double
+    mean_square = (double * (ha**2 + hb**2 + hc**2)[:, 0] / 3).sum()
+    return _frequency((double * slope**2).sum(), mean_square)
+
+
+def picture_frequency(picture: Float[np.ndarray, "height width"]) -> float:
+    """The same for a picture's tone, in cycles per longer side."""
+    tone = picture - picture.mean()
+    rows, columns = np.gradient(tone)
+    frequency = _frequency((rows**2 + columns**2).sum(), (tone**2).sum())
+    return frequency * max(picture.shape)
+
+
+def _frequency(square_slope: float, square_height: float) -> float:
+    return float(np.sqrt(square_slope / max(square_height, 1e-30)) / (2 * np.pi))

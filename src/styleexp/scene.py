@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from styleexp import meshes, styles
+from styleexp import meshes, relief, styles
 from styleexp.config import check
 from styleexp.encoders import load_encoder
 from styleexp.errors import UserError
 from styleexp.geometry import Surface, vertex_areas
 from styleexp.losses import StyleLoss
 from styleexp.registry import build
-from styleexp.relief import relief_height
 from styleexp.renderers.base import Shading
 from styleexp.renderers.specs import RENDERERS
 from styleexp.sources import load_source, load_style
@@ -32,8 +31,11 @@ if TYPE_CHECKING:
     from styleexp.styles import StyleTarget
 
 
-BOUND_MARGIN = 1.2
+BOUND_MARGIN = 1.3
 """How much farther than the style's own relief the displacement may reach."""
+
+PICTURE_DETAIL = 128
+"""Pixels on a picture's longer side when its frequency is measured; finer detail doesn't count."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +49,8 @@ class Scene:
     frame: meshes.Normalisation
     surface: Surface
     areas: Float[Tensor, " vertices"]
-    unit: float
-    """Radii of the normalised source in which ``field.sigma`` and ``field.bound`` are given."""
+    sigma: float
+    """Of the Fourier features, in cycles per radius of the normalised source."""
     bound: float
     """Displacements lie in (-bound, bound), in radii of the normalised source."""
     viewer: Viewer
@@ -99,7 +101,8 @@ def prepare(config: Config) -> Scene:
             target = styles.FixedTarget(loss, styles.image_bank(picture, config, unit))
     if config.style.scale_by == "frame":
         unit = 1.0
-    notes += too_coarse(source, unit / config.field.sigma)
+    sigma, bound = choose_field(config.field, style)
+    notes += too_coarse(source, unit / sigma)
     goal, own = target(0), styles.mesh_target(loss, viewer, surface.vertices)(0)
     return Scene(
         config=config,
@@ -108,8 +111,8 @@ def prepare(config: Config) -> Scene:
         frame=frame,
         surface=surface,
         areas=vertex_areas(surface),
-        unit=unit,
-        bound=unit * choose_bound(config.field, style),
+        sigma=sigma / unit,
+        bound=bound * unit,
         viewer=viewer,
         loss=loss,
         target=target,
@@ -130,23 +133,29 @@ def pattern_unit(config: StyleConfig, source: meshes.Mesh, style: meshes.Mesh | 
     return config.scale * normalised_size(source) / sphere / unit
 
 
-def choose_bound(config: FieldConfig, style: meshes.Mesh | np.ndarray) -> float:
-    """The displacement's bound in the style's own radii: see ``FieldConfig.bound``."""
-    if config.bound is not None:
-        return config.bound
-    if not isinstance(style, meshes.Mesh):
-        return 0.05
-    vertices = meshes.normalisation(style.vertices).apply(style.vertices)
-    normals = meshes.vertex_normals(vertices, style.faces)
-    height = relief_height(vertices, style.faces, normals, length=0.5)
-    return min(max(BOUND_MARGIN * height, 0.01), 0.1)
+def choose_field(config: FieldConfig, style: meshes.Mesh | np.ndarray) -> tuple[float, float]:
+    """sigma and bound in the style's own radii: as configured, or what the style's relief needs."""
+    if isinstance(style, meshes.Mesh):
+        vertices = meshes.normalisation(style.vertices).apply(style.vertices)
+        normals = meshes.vertex_normals(vertices, style.faces)
+        height = relief.mesh_relief(vertices, style.faces, normals, length=0.5)
+        frequency = relief.mesh_frequency(height, vertices, style.faces)
+        bound = min(max(BOUND_MARGIN * relief.half_range(height), 0.01), 0.1)
+    else:
+        small = styles.resized(torch.from_numpy(style).mean(-1), PICTURE_DETAIL)
+        frequency = relief.picture_frequency(small.numpy()) / math.sqrt(4 * math.pi)
+        bound = 0.05
+    return (
+        min(max(frequency, 1.0), 10.0) if config.sigma is None else config.sigma,
+        bound if config.bound is None else config.bound,
+    )
 
 
 def too_coarse(mesh: meshes.Mesh, wavelength: float) -> list[str]:
     """A note where the mesh's edges can't carry details of this size, in radii."""
     edge = meshes.mean_edge_length(mesh.vertices, mesh.faces)
     edge /= meshes.normalisation(mesh.vertices).scale
-    if edge <= wavelength / 3:
+    if edge <= wavelength / 4:
         return []
     enough = int(len(mesh.vertices) * (4 * edge / wavelength) ** 2)
     return [

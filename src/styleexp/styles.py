@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Protocol
 
 import torch
@@ -71,12 +72,12 @@ def image_bank(
 ) -> Iterator[tuple[Images, Images]]:
     """Windows of a style picture with the texel density that the views of the result have.
 
-    The picture's longer side spans ``image_tile * unit`` radii of the source; it is mirrored at
-    its borders where a view is wider. Each batch holds ``count`` global and ``count * per_view``
-    local windows at random places.
+    A square picture has the area of a sphere of radius ``image_tile * unit``, in radii of the
+    source; it is mirrored at its borders where a view is wider. Each batch holds ``count`` global
+    and ``count * per_view`` local windows at random places.
     """
     views_, local = config.views, config.views.local
-    span = config.style.image_tile * unit
+    span = config.style.image_tile * unit * math.sqrt(4 * math.pi)
     for generator in _batches(config):
         yield (
             _windows(
@@ -98,10 +99,8 @@ def whole_image_bank(
     """The paper's reading: the picture itself is the global view, local views are its crops."""
     count, local = config.views.count, config.views.local
     size = [config.views.resolution, config.views.resolution]
-    resized = functional.interpolate(
-        picture[None, None], size, mode="bilinear", antialias=True, align_corners=False
-    )
-    image = resized.permute(0, 2, 3, 1).expand(count, -1, -1, -1)
+    whole = functional.interpolate(picture[None, None], size, mode="bilinear", antialias=True)
+    image = whole.permute(0, 2, 3, 1).expand(count, -1, -1, -1)
     for generator in _batches(config):
         windows, view = views.crop_windows(local, count, generator)
         cut = views.crop_images(image, windows.to(image), view.to(image.device), local.size)
@@ -130,6 +129,15 @@ def tone(
     return ((picture - centre) * contrast + goal).clamp(0, 1)
 
 
+def resized(
+    picture: Float[Tensor, "height width"], longer_side: float
+) -> Float[Tensor, "rows columns"]:
+    """The picture with about ``longer_side`` pixels on its longer side, free of aliasing."""
+    factor = longer_side / max(picture.shape)
+    shape = [max(8, round(side * factor)) for side in picture.shape]
+    return functional.interpolate(picture[None, None], shape, mode="bilinear", antialias=True)[0, 0]
+
+
 def global_texels(config: ViewsConfig) -> float:
     """Pixels of a global view that a length of one source radius at the object's centre takes."""
     half = config.distance * torch.tensor(config.fov / 2).deg2rad().tan().item()
@@ -152,16 +160,13 @@ def _windows(
     count: int,
     generator: torch.Generator,
 ) -> Images:
-    factor = longer_side / max(picture.shape)
-    shape = [max(8, round(side * factor)) for side in picture.shape]
-    resized = functional.interpolate(
-        picture[None, None], shape, mode="bilinear", antialias=True, align_corners=False
-    )[0, 0]
+    shown = resized(picture, longer_side)
+    height, width = shown.shape
     cut = []
     for dy, dx in torch.rand(count, 2, generator=generator).tolist():
-        rows = _mirrored(int(dy * 2 * shape[0]), size, shape[0], picture.device)
-        columns = _mirrored(int(dx * 2 * shape[1]), size, shape[1], picture.device)
-        cut.append(resized[rows][:, columns])
+        rows = _mirrored(int(dy * 2 * height), size, height, picture.device)
+        columns = _mirrored(int(dx * 2 * width), size, width, picture.device)
+        cut.append(shown[rows][:, columns])
     return _all_seen(torch.stack(cut)[..., None])
 
 

@@ -93,9 +93,7 @@ def start(scene: Scene) -> State:
     """The state before the first step: M = C."""
     optim = scene.config.optim
     generator = step_generator(optim.seed, 0, stream=7)
-    displacement_field = DisplacementField(
-        scene.config.field, generator, scene.bound, scene.unit
-    )
+    displacement_field = DisplacementField(scene.config.field, generator, scene.sigma, scene.bound)
     displacement_field.to(scene.surface.vertices.device)
     adam = torch.optim.Adam(displacement_field.parameters(), lr=optim.rate)
     return State(displacement_field, adam)

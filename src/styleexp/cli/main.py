@@ -6,16 +6,21 @@ import difflib
 import os
 import re
 import sys
+import warnings
 from typing import NoReturn
 
 # Spinning OpenMP threads made a 28 ms render take 3 s on two busy cores. Read when torch loads.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
+DEBUG = "debug=true"
+
+
 def main() -> None:
     """Entry point of the ``styleexp`` command."""
     from styleexp.errors import UserError
 
+    warnings.showwarning = _show_warning  # type: ignore[assignment]
     try:
         resume = [a for a in sys.argv[1:] if a.startswith("resume=")]
         if resume:
@@ -23,6 +28,8 @@ def main() -> None:
         else:
             _hydra()
     except UserError as error:
+        if DEBUG in sys.argv:
+            raise
         _stop(str(error))
     except KeyboardInterrupt:
         sys.exit(130)
@@ -68,11 +75,11 @@ def _hydra() -> None:
     try:
         job()
     except (HydraException, OmegaConfBaseException) as error:
-        if "debug=true" in sys.argv:
+        if DEBUG in sys.argv:
             raise
         _stop(explain(error))
     except OSError as error:
-        if "debug=true" in sys.argv:
+        if DEBUG in sys.argv:
             raise
         _stop(f"cannot write the run's folder: {error}; choose another with hydra.run.dir=FOLDER.")
     if failures:
@@ -139,6 +146,10 @@ def _resume(folder: str) -> None:
             f"drop {' '.join(others)}."
         )
     sys.exit(resume(Path(folder)))
+
+
+def _show_warning(message: Warning | str, *details: object) -> None:
+    print(f"warning: {message}", file=sys.stderr)
 
 
 def _stop(message: str) -> NoReturn:

@@ -71,8 +71,8 @@ class Shading:
     normals: str = "flat"
     """``flat`` (one normal a face) or ``smooth`` (area-weighted vertex normals, interpolated)."""
     outlines: bool = True
-    """Whether backends that can differentiate visibility do: outlines are then anti-aliased and pull
-    on the vertices. Without, outlines are hard and gradients are those of shading alone."""
+    """Whether backends that can differentiate visibility do: outlines are then anti-aliased and
+    pull on the vertices. Without, outlines are hard and gradients are those of shading alone."""
 
 
 @dataclass(frozen=True)
