@@ -22,7 +22,7 @@ demo: $(VENV)/.installed
 	$(BIN)/styleexp source=critter style=bubble hydra.run.dir=outputs/demo
 
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

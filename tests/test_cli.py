@@ -261,3 +261,35 @@ def with_style(folder):
     style = shapes.make("stripe", detail=2000)
     meshes.save_mesh(style, style.vertices, folder / "there.ply")
     return folder
+
+
+def test_texture_coordinates_and_faces_of_a_real_mesh_survive(named_mesh, tmp_path):
+    """spot with a seam around it: its GLB keeps every corner's UV, its faces stay as they were."""
+    import trimesh
+
+    corners, uvs, faces = with_seam(styleexp.load_mesh(named_mesh("spot")), tmp_path / "spot.obj")
+    done = command(
+        "source.path=spot.obj", "style=bubble", *SMOKE, "hydra.run.dir=run", cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    exported = trimesh.load(tmp_path / "run" / "result.glb", process=False).to_mesh()
+    assert exported.faces.shape == faces.shape
+    np.testing.assert_allclose(exported.visual.uv[exported.faces], uvs[corners], atol=1e-5)
+    result = styleexp.load_mesh(tmp_path / "run" / "result.glb")
+    assert np.array_equal(result.faces, styleexp.load_mesh(tmp_path / "spot.obj").faces)
+
+
+def with_seam(mesh, path):
+    """Write a mesh as OBJ with cylindrical texture coordinates that jump at a seam."""
+    angle = np.arctan2(mesh.vertices[:, 0], mesh.vertices[:, 2]) / (2 * np.pi) + 0.5
+    height = mesh.vertices[:, 1]
+    height = (height - height.min()) / np.ptp(height)
+    uvs = np.concatenate([np.stack([angle, height], 1), np.stack([angle + 1, height], 1)])
+    spread = np.ptp(angle[mesh.faces], axis=1) > 0.5
+    corners = mesh.faces + len(angle) * (spread[:, None] & (angle[mesh.faces] < 0.5))
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()]
+    lines += [f"vt {u!r} {v!r}" for u, v in uvs.tolist()]
+    pairs = np.stack([mesh.faces, corners], axis=2) + 1
+    lines += ["f " + " ".join(f"{v}/{t}" for v, t in face) for face in pairs.tolist()]
+    path.write_text("\n".join(lines) + "\n")
+    return corners, uvs, mesh.faces

@@ -83,7 +83,7 @@ class LocalViewsConfig:
     """``image``: crops of the rendered global view, as in the paper. ``zoom``: the same windows,
     rendered anew by a zoomed camera. ``surface``: a zoomed camera aimed at a random point of the
     surface."""
-    per_view: int = 4
+    per_view: int = 10
     """Local views for each global view."""
     crop: str = "side"
     """``image`` and ``zoom``: whether the paper's 10 % are of the ``side`` or of the ``area``."""
@@ -99,7 +99,7 @@ class LocalViewsConfig:
 class ViewsConfig:
     """Global views (Secs. 3.3.1 and 4.1)."""
 
-    count: int = 5
+    count: int = 2
     resolution: int = 250
     fov: float = 60.0
     """Field of view in degrees."""
@@ -181,7 +181,7 @@ class LossConfig:
 class OptimConfig:
     """Adam with a stepped rate (Sec. 4.1)."""
 
-    steps: int = 150
+    steps: int = 200
     rate: float = 2e-3
     schedule: str = "cosine"
     """``step``: the rate is multiplied by ``decay`` every ``decay_every`` steps, as in the paper.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,8 +16,6 @@ from styleexp.renderers.soft_raster import SoftRaster
 from styleexp.views import orbit, zoom
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from jaxtyping import Float
 
     from styleexp.stylize import Result
@@ -79,7 +78,8 @@ def write_preview(result: Result, path: Path) -> None:
     else:
         picture = Image.fromarray((scene.style * 255).round().astype(np.uint8)).convert("L")
         picture.thumbnail((size, size))
-        rows.append(("style: image", [picture]))
+        chosen = scene.config.style
+        rows.append((f"style: {Path(chosen.path or str(chosen.name)).stem}", [picture]))
     generated = scene.frame.apply(result.vertices)
     rows.append(("result", shown(generated, scene.source.faces)))
     _sheet(rows, size).save(path)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from styleexp.styles import StyleTarget
 
 
-BOUND_MARGIN = 1.3
+BOUND_MARGIN = 1.5
 """How much farther than the style's own relief the displacement may reach."""
 
 PICTURE_DETAIL = 128
