@@ -69,8 +69,8 @@ class FieldConfig:
     depth: int = 8
     """Fully connected layers, the output layer included."""
     bound: float | None = None
-    """Displacements lie in (-bound, bound), in radii; see ``style.scale_by``. null: what the style
-    mesh's own relief needs, and 0.05 for a picture. The paper has 0.1."""
+    """Displacements lie in (-bound, bound), in radii; see ``style.scale_by``. null: twice
+    what the style mesh's own relief needs, 0.07 for a picture. The paper has 0.1."""
     zero_mean: bool = True
     """Subtract the area-weighted mean displacement, so that the mesh can't shrink as a whole."""
 
@@ -175,6 +175,9 @@ class LossConfig:
     """``bank``: the style's Grams are averaged once over a bank of views. ``same_views``: the style
     mesh is rendered at the result's views in every step, as in the paper."""
     bank_views: int = 24
+    relief_weight: float = 0.3
+    """Weight of mean((d / r)^4), where r is half the range of the style's relief: keeps the
+    displacement from flattening out at its bound. Not in the paper."""
 
 
 @dataclass
@@ -276,6 +279,7 @@ BETWEEN = {
     "shading.albedo": (0.0, 1.0),
     "shading.light_spread": (0.0, 180.0),
     "loss.erosion": (0, 64),
+    "loss.relief_weight": (0.0, 1e6),
     "preview.resolution": (32, 4096),
     "threads": (0, 4096),
 }

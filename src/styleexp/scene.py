@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from styleexp import meshes, relief, styles
+from styleexp import meshes, styles
 from styleexp.config import check
 from styleexp.encoders import load_encoder
 from styleexp.errors import UserError
 from styleexp.geometry import Surface, vertex_areas
 from styleexp.losses import StyleLoss
 from styleexp.registry import build
+from styleexp.relief import half_range, mesh_frequency, mesh_relief, picture_frequency
 from styleexp.renderers.base import Shading
 from styleexp.renderers.specs import RENDERERS
 from styleexp.sources import load_source, load_style
@@ -31,8 +32,11 @@ if TYPE_CHECKING:
     from styleexp.styles import StyleTarget
 
 
-BOUND_MARGIN = 1.5
+BOUND_MARGIN = 2.0
 """How much farther than the style's own relief the displacement may reach."""
+
+PICTURE_RELIEF = 0.035
+"""Half the range of a picture's relief, in radii: a picture doesn't tell its height."""
 
 PICTURE_DETAIL = 128
 """Pixels on a picture's longer side when its frequency is measured; finer detail doesn't count."""
@@ -53,6 +57,8 @@ class Scene:
     """Of the Fourier features, in cycles per radius of the normalised source."""
     bound: float
     """Displacements lie in (-bound, bound), in radii of the normalised source."""
+    relief: float
+    """Half the range of the style's own relief, in such radii."""
     viewer: Viewer
     loss: StyleLoss
     target: StyleTarget
@@ -101,7 +107,7 @@ def prepare(config: Config) -> Scene:
             target = styles.FixedTarget(loss, styles.image_bank(picture, config, unit))
     if config.style.scale_by == "frame":
         unit = 1.0
-    sigma, bound = choose_field(config.field, style)
+    sigma, bound, height = choose_field(config.field, style)
     notes += too_coarse(source, unit / sigma)
     goal, own = target(0), styles.mesh_target(loss, viewer, surface.vertices)(0)
     return Scene(
@@ -113,6 +119,7 @@ def prepare(config: Config) -> Scene:
         areas=vertex_areas(surface),
         sigma=sigma / unit,
         bound=bound * unit,
+        relief=height * unit,
         viewer=viewer,
         loss=loss,
         target=target,
@@ -133,22 +140,24 @@ def pattern_unit(config: StyleConfig, source: meshes.Mesh, style: meshes.Mesh | 
     return config.scale * normalised_size(source) / sphere / unit
 
 
-def choose_field(config: FieldConfig, style: meshes.Mesh | np.ndarray) -> tuple[float, float]:
-    """sigma and bound in the style's own radii: as configured, or what the style's relief needs."""
+def choose_field(
+    config: FieldConfig, style: meshes.Mesh | np.ndarray
+) -> tuple[float, float, float]:
+    """sigma, bound and the half range of the relief, in the style's own radii: as configured, or
+    measured on the style."""
     if isinstance(style, meshes.Mesh):
         vertices = meshes.normalisation(style.vertices).apply(style.vertices)
         normals = meshes.vertex_normals(vertices, style.faces)
-        height = relief.mesh_relief(vertices, style.faces, normals, length=0.5)
-        frequency = relief.mesh_frequency(height, vertices, style.faces)
-        bound = min(max(BOUND_MARGIN * relief.half_range(height), 0.01), 0.1)
+        relief = mesh_relief(vertices, style.faces, normals, length=0.5)
+        frequency = mesh_frequency(relief, vertices, style.faces)
+        height = min(max(half_range(relief), 0.005), 0.05)
     else:
         small = styles.resized(torch.from_numpy(style).mean(-1), PICTURE_DETAIL)
-        frequency = relief.picture_frequency(small.numpy()) / math.sqrt(4 * math.pi)
-        bound = 0.05
-    return (
-        min(max(frequency, 1.0), 10.0) if config.sigma is None else config.sigma,
-        bound if config.bound is None else config.bound,
-    )
+        frequency = picture_frequency(small.numpy()) / math.sqrt(4 * math.pi)
+        height = PICTURE_RELIEF
+    sigma = min(max(frequency, 1.0), 10.0) if config.sigma is None else config.sigma
+    bound = BOUND_MARGIN * height if config.bound is None else config.bound
+    return sigma, bound, height
 
 
 def too_coarse(mesh: meshes.Mesh, wavelength: float) -> list[str]:

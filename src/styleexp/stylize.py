@@ -116,6 +116,7 @@ def optimise(scene: Scene, state: State) -> Iterator[Step]:
         loss_global = loss.distance(loss.grams(whole), whole_target, scene.scales[0])
         loss_local = loss.distance(loss.grams(local), local_target, scene.scales[1])
         total = loss.config.lambda_global * loss_global + loss.config.lambda_local * loss_local
+        total = total + loss.config.relief_weight * (displacement / scene.relief).pow(4).mean()
 
         if not math.isfinite(total.item()):
             raise UserError(
