@@ -70,7 +70,7 @@ class FieldConfig:
     """Fully connected layers, the output layer included."""
     bound: float | None = None
     """Displacements lie in (-bound, bound), in radii; see ``style.scale_by``. null: twice
-    what the style mesh's own relief needs, 0.07 for a picture. The paper has 0.1."""
+    what the style mesh's own relief needs, 0.05 for a picture. The paper has 0.1."""
     zero_mean: bool = True
     """Subtract the area-weighted mean displacement, so that the mesh can't shrink as a whole."""
 
@@ -158,7 +158,7 @@ class LossConfig:
         default_factory=lambda: ["conv1_1", "conv2_1", "conv3_1", "conv4_1", "conv5_1"]
     )
     """Style layers, by name or by the paper's 1-based index of VGG-19's convolutions."""
-    block_weights: list[float] = option(default_factory=lambda: [0.3, 0.5, 1.0, 2.0, 2.0])
+    block_weights: list[float] = option(default_factory=lambda: [0.6, 0.8, 1.0, 1.4, 1.2])
     """A weight for the layers of each of VGG's five blocks."""
     lambda_global: float = 0.3
     lambda_local: float = 1.0

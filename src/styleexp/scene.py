@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 BOUND_MARGIN = 2.0
 """How much farther than the style's own relief the displacement may reach."""
 
-PICTURE_RELIEF = 0.035
+PICTURE_RELIEF = 0.025
 """Half the range of a picture's relief, in radii: a picture doesn't tell its height."""
 
 PICTURE_DETAIL = 128

@@ -53,6 +53,9 @@ def _guarded(
             f"writing to '{folder.path}' failed ({error.strerror or error}): free some space or "
             "choose another folder with hydra.run.dir=FOLDER."
         ) from error
+    except KeyboardInterrupt:
+        folder.write_status("interrupted", reason="stopped by the user")
+        raise
     except Exception as error:
         _fail(folder, str(error))
         raise
@@ -89,6 +92,7 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
         "device": str(scene.surface.vertices.device),
         "encoder_precision": scene.loss.encoder.precision,
         "threads": torch.get_num_threads(),
+        "chosen": {"sigma": scene.sigma, "bound": scene.bound, "relief": scene.relief},
         "assets": sources.describe(config),
         "notes": list(scene.notes),
     }
