@@ -184,7 +184,7 @@ class LossConfig:
 class OptimConfig:
     """Adam with a stepped rate (Sec. 4.1)."""
 
-    steps: int = 200
+    steps: int = 160
     rate: float = 2e-3
     schedule: str = "cosine"
     """``step``: the rate is multiplied by ``decay`` every ``decay_every`` steps, as in the paper.

@@ -153,13 +153,14 @@ def _progress(steps: Iterator[Step], state: State, total: int) -> Iterator[Step]
     from rich.console import Console
 
     if not Console().is_terminal:
+        begun, first = time.perf_counter(), state.step
         every = max(1, total // 10)
         for step in steps:
             if step.step == 1 or step.step % every == 0 or step.step == total:
-                left = (total - step.step) * step.seconds
+                rate = (step.step - first) / (time.perf_counter() - begun)
                 print(
-                    f"step {step.step}/{total}  loss {step.loss:.4g}  "
-                    f"{1 / step.seconds:.2f} steps/s  {left:.0f} s left",
+                    f"step {step.step}/{total}  loss {step.loss:.4g}  {rate:.2f} steps/s  "
+                    f"{(total - step.step) / rate:.0f} s left",
                     flush=True,
                 )
             yield step
