@@ -154,6 +154,7 @@ class EncoderConfig:
 class LossConfig:
     """The style loss (Eqs. 3-8)."""
 
+    name: str = "gram"
     layers: list[Any] = option(
         default_factory=lambda: ["conv1_1", "conv2_1", "conv3_1", "conv4_1", "conv5_1"]
     )
