@@ -259,8 +259,8 @@ def test_of_two_plugins_with_one_name_none_is_taken(installed, listed, tmp_path)
 def test_built_in_names_are_kept_and_the_refusal_is_told(installed, listed, tmp_path):
     refused = listed["renderers", "soft_raster", "1.2"]["reason"]
     assert refused == "styleexp has that name, second (lab:SHADOW) can't have it"
-    done = styleexp("style=buble", *SMOKE, "renderer.visibility_gradient=none", "style=bubble",
-                    "optim.steps=0", cwd=tmp_path, path=installed)  # fmt: skip
+    done = styleexp("style=bubble", "optim.steps=0", *SMOKE, cwd=tmp_path, path=installed)
+    assert "optim.steps=0" in done.stderr
     assert f"warning: renderer=soft_raster: {refused}." in done.stderr
 
 
@@ -363,19 +363,32 @@ def test_a_style_of_a_plugin_from_python(installed, tmp_path):
     assert "24 (96, 96, 3)" in done.stdout, done.stderr
 
 
-def test_without_a_package(tmp_path):
+def test_the_guides_file_works_without_a_package(tmp_path):
+    guide = (ROOT / "docs/write-a-backend.md").read_text()
+    (tmp_path / "gentle.py").write_text(guide.split("```python\n")[1].split("```")[0])
     (tmp_path / "lab.py").write_text(textwrap.dedent(GOOD))
-    named = {"STYLEEXP_PLUGINS": "renderer=lab:QUICK, field=lab:FIELD"}
+    named = {"STYLEEXP_PLUGINS": "renderer=gentle:GENTLE, field=lab:FIELD"}
     command = Path(sysconfig.get_path("scripts")) / "styleexp"  # its path lacks the folder we're in
-    done = process(command, "renderer=quick", "--help", cwd=tmp_path, **named)
-    assert "renderer: quick, soft_raster" in done.stdout, done.stderr
+    done = process(command, "renderer=gentle", "--help", cwd=tmp_path, **named)
+    assert "renderer: gentle, soft_raster" in done.stdout, done.stderr
     assert "field: fourier_mlp, lab_field" in done.stdout
-    done = styleexp("renderer=quick", "renderer.samples=x", "style=bubble", cwd=tmp_path, **named)
-    assert "samples" in done.stderr
     done = process(
-        sys.executable, "-m", "styleexp.cli.plugins", cwd=tmp_path, **named,
+        command,
+        "renderer=gentle",
+        "renderer.limit=0",
+        "style=bubble",
+        *SMOKE,
+        cwd=tmp_path,
+        **named,
+    )
+    assert "renderer.limit=0.0 is not allowed" in done.stderr
+    done = process(
+        command, "renderer=gentle", "renderer.limit=0.1", "style=bubble", *SMOKE,
+        "encoder=vgg19_random", cwd=tmp_path, **named,
     )  # fmt: skip
-    assert "STYLEEXP_PLUGINS (renderer=lab:QUICK)" in done.stdout
+    assert done.returncode == 0, done.stderr
+    done = process(sys.executable, "-m", "styleexp.cli.plugins", cwd=tmp_path, **named)
+    assert "STYLEEXP_PLUGINS (renderer=gentle:GENTLE)" in done.stdout
 
 
 @pytest.mark.parametrize(
