@@ -190,7 +190,7 @@ def _everything(variable: str) -> tuple[Choice, ...]:
             told = f"{owners[key]} has that name, {plugin.origin} can't have it"
             plugin = replace(plugin, fault=told, error=None, ceded=True)
         elif len(origins) > 1:
-            told = f"{' and '.join(origins)} both have that name: uninstall one"
+            told = f"{' and '.join(origins)} have the same name: keep only one of them"
             plugin = replace(plugin, fault=told, error=None)
         found.append(plugin)
     return tuple(found)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import warnings
 from collections.abc import Sequence
 
 from styleexp import plugins
@@ -20,7 +21,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--json", action="store_true", help="as JSON, a list of objects")
     options = parser.parse_args(arguments)
-    choices = plugins.everything()
+    with warnings.catch_warnings(action="ignore"):  # the list says it
+        choices = plugins.everything()
     if options.json:
         print(json.dumps([_row(choice) for choice in choices], indent=2))
         return 0
