@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,32 +10,35 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
 from styleexp import config as schema
+from styleexp import plugins
 from styleexp.assets import names as asset_names
-from styleexp.encoders.specs import ENCODERS
-from styleexp.renderers.specs import RENDERERS
 from styleexp.shapes import SOURCES, STYLES
 
 CONFIG_PATH = "pkg://styleexp.conf"
+PARTS = ("renderer", "encoder", "style", "field", "loss")
+"""Keys of the configuration whose options are those of the part that they name."""
 
 
 def register() -> None:
     """Tell Hydra the schema, and one option for each registered name. Safe to call again."""
     store = ConfigStore.instance()
     store.store(name="base_config", node=schema.Config)
-    for spec in RENDERERS.values():
-        store.store(group="renderer", name=spec.name, node=spec.config)
-    for name in ENCODERS:
-        store.store(group="encoder", name=name, node={"name": name})
-    store.store(group="field", name="fourier_mlp", node={"name": "fourier_mlp"})
     meshes, pictures = asset_names("mesh"), asset_names("image")
     for name in {*SOURCES, *STYLES, *meshes}:
         store.store(group="source", name=name, node={"name": name})
-    for name in {*SOURCES, *STYLES, *meshes, *pictures}:
+    for name in {*meshes, *pictures}:
         store.store(group="style", name=name, node={"name": name})
+    broken = []
+    for choice in plugins.everything():
+        if choice.fault:
+            broken.append(f"{choice.kind}={choice.name}")
+        elif choice.kind in PARTS:
+            node = choice.spec.config(name=choice.name)
+            store.store(group=choice.kind, name=choice.name, node=node)
     store.store(
         group="hydra/help",
         name="styleexp",
-        node={"app_name": "styleexp", "header": HELP_HEADER, "template": HELP_TEMPLATE},
+        node={"app_name": "styleexp", "header": _header(broken), "template": HELP_TEMPLATE},
     )
     OmegaConf.register_new_resolver("run_name", _run_name, replace=True)
 
@@ -43,11 +47,23 @@ def typed(config: DictConfig) -> schema.Config:
     """The composed configuration as plain dataclasses."""
     plain = OmegaConf.to_container(config, resolve=True)
     assert isinstance(plain, dict)
-    renderer = plain.pop("renderer")
+    parts = {kind: _part(kind, plain.pop(kind, None)) for kind in PARTS}
     built: Any = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema.Config), plain))
-    options = RENDERERS[renderer["name"]].config if renderer["name"] in RENDERERS else dict
-    built.renderer = options(**renderer)
+    for kind, part in parts.items():
+        setattr(built, kind, part)
     return built
+
+
+def _part(kind: str, plain: dict[str, Any] | None) -> Any:
+    """One part's options, of the dataclass that belongs to its name."""
+    name = (plain or {}).get("name")
+    plugins.warn_of_rivals(kind, name)
+    options = plugins.KINDS[kind].base
+    if name is not None and (kind != "style" or plugins.known(kind, name)):
+        options = plugins.find(kind, name).spec.config
+    if options is None:
+        return None
+    return OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(options), plain or {}))
 
 
 def compose(overrides: Sequence[str]) -> schema.Config:
@@ -66,6 +82,13 @@ def _run_name(source: Any, style: Any) -> str:
         return PurePath(part.path).stem if part.path else str(part.name)
 
     return f"{short(source)}-{short(style)}"
+
+
+def _header(broken: Sequence[str]) -> str:
+    if not broken:
+        return HELP_HEADER
+    told = re.sub(r"[^\w.:=, -]", "?", ", ".join(broken))  # the header is a template
+    return f"{HELP_HEADER}\nThese plugins can't be used, styleexp-plugins says why: {told}\n"
 
 
 HELP_HEADER = """\

@@ -154,11 +154,12 @@ class EncoderConfig:
 class LossConfig:
     """The style loss (Eqs. 3-8)."""
 
+    name: str = "gram"
     layers: list[Any] = option(
         default_factory=lambda: ["conv1_1", "conv2_1", "conv3_1", "conv4_1", "conv5_1"]
     )
     """Style layers, by name or by the paper's 1-based index of VGG-19's convolutions."""
-    block_weights: list[float] = option(default_factory=lambda: [0.6, 0.8, 1.0, 1.4, 1.2])
+    block_weights: list[float] = option(default_factory=lambda: [0.3, 0.5, 1.0, 2.0, 2.0])
     """A weight for the layers of each of VGG's five blocks."""
     lambda_global: float = 0.3
     lambda_local: float = 1.0

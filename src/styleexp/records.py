@@ -16,6 +16,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from styleexp import plugins
 from styleexp.errors import UserError
 
 if TYPE_CHECKING:
@@ -143,6 +144,7 @@ def describe(config: Any, overrides: list[str], command: list[str]) -> dict[str,
         "overrides": overrides,
         "config": asdict(config),
         "versions": {"python": platform.python_version(), **_versions()},
+        "plugins": plugins.used(config),
         "platform": {"system": platform.platform(), "machine": platform.machine()},
     }
 

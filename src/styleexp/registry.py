@@ -2,30 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
-
-from styleexp.errors import UserError, unknown_name
 
 
 @dataclass(frozen=True)
 class Spec:
-    """One choice of a kind of part."""
+    """One choice of a kind of part, built in or a plugin's.
+
+    What the factory is called with, and what ``config`` has to be:
+
+    - renderer: ``factory(options)``; any dataclass.
+    - encoder: ``factory(options, device=, seed=)``; ``config.EncoderConfig`` or a subclass.
+    - style: ``factory(options)``; ``config.StyleConfig`` or a subclass. Returns a mesh, or an image
+      of shape (height, width, 3) in [0, 1].
+    - field: ``factory(options, generator=, sigma=, bound=)``; ``config.FieldConfig`` or a subclass.
+    - loss: ``factory(options, encoder=)``; ``config.LossConfig`` or a subclass.
+    - baseline: listed only, so far.
+    """
 
     name: str
     description: str
     config: type
-    """Dataclass of its options, with a ``name`` field; what Hydra validates against."""
-    factory: Callable[[Any], Any]
+    """Dataclass of its options, with a ``name`` field and a default for each; what Hydra validates
+    against."""
+    factory: Callable[..., Any]
     """Builds the part from such options. Heavy imports belong inside."""
-
-
-def build(kind: str, registry: Mapping[str, Spec], options: Any) -> Any:
-    """Build the part that ``options.name`` names; an unknown name is a `UserError`."""
-    name = getattr(options, "name", None)
-    if name is None:
-        raise UserError(f"no {kind} was chosen: give {kind}=NAME, one of {', '.join(registry)}.")
-    if name not in registry:
-        raise unknown_name(kind, name, registry)
-    return registry[name].factory(options)
+    requires: tuple[str, ...] = ()
+    """Top-level import names of packages that it needs and that may be missing."""
+    extra: str | None = None
+    """The extra of its own distribution that brings them."""

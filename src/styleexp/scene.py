@@ -10,14 +10,11 @@ import torch
 
 from styleexp import meshes, styles
 from styleexp.config import check
-from styleexp.encoders import load_encoder
 from styleexp.errors import UserError
 from styleexp.geometry import Surface, vertex_areas
-from styleexp.losses import StyleLoss
-from styleexp.registry import build
+from styleexp.plugins import build
 from styleexp.relief import half_range, mesh_frequency, mesh_relief, picture_frequency
 from styleexp.renderers.base import Shading
-from styleexp.renderers.specs import RENDERERS
 from styleexp.sources import load_source, load_style
 from styleexp.viewer import Viewer
 from styleexp.views import orbit
@@ -28,6 +25,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from styleexp.config import Config, FieldConfig, StyleConfig
+    from styleexp.losses import StyleLoss
     from styleexp.renderers.base import Renderer
     from styleexp.styles import StyleTarget
 
@@ -75,18 +73,11 @@ def prepare(config: Config) -> Scene:
     source = load_source(config.source)
     style = load_style(config.style)
     frame, surface = normalised(source, device)
-    renderer = build("renderer", RENDERERS, config.renderer)
+    renderer = build("renderer", config.renderer)
     grey = foreground_mean(config, renderer, surface)
     shading = choose_shading(config, grey)
-    encoder = load_encoder(
-        config.encoder.name,
-        precision=config.encoder.precision,
-        pooling=config.encoder.pooling,
-        normalisation=config.encoder.normalisation,
-        device=device,
-        seed=config.optim.seed,
-    )
-    loss = StyleLoss(config.loss, encoder)
+    encoder = build("encoder", config.encoder, device=device, seed=config.optim.seed)
+    loss = build("loss", config.loss, encoder=encoder)
     viewer = Viewer(config, renderer, shading, surface)
     notes = list(source.repairs)
     target: StyleTarget

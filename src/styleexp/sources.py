@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from styleexp import assets, images, meshes, shapes
+from styleexp import assets, images, meshes, plugins, shapes
 from styleexp.errors import UserError, unknown_name
 
 if TYPE_CHECKING:
@@ -26,22 +26,38 @@ def load_source(config: SourceConfig) -> meshes.Mesh:
 
 def load_style(config: StyleConfig) -> meshes.Mesh | np.ndarray:
     """The style: a mesh, or an image of shape (height, width, 3) in [0, 1]."""
+    if config.path is None and plugins.known("style", config.name):
+        return _checked(plugins.build("style", config), config.name)
     return _load("style", config.name, config.path)
 
 
+def _checked(style: meshes.Mesh | np.ndarray, name: str | None) -> meshes.Mesh | np.ndarray:
+    """What a style's factory returned, if it can be used."""
+    import numpy as np
+
+    if isinstance(style, meshes.Mesh):
+        return style
+    if isinstance(style, np.ndarray) and style.ndim == 3 and style.shape[2] == 3:
+        return style.astype(np.float32, copy=False)
+    raise UserError(
+        f"the style '{name}' is a {type(style).__name__}: its factory must return a Mesh or an "
+        "image of shape (height, width, 3)."
+    )
+
+
 def locate(kind: str, name: str | None, path: str | None) -> Path | None:
-    """The file behind a source or style; None for an analytic shape."""
+    """The file behind a source or style; None for an analytic shape or a plugin's style."""
     if path is not None:
         return Path(path)
     if name is None:
         raise UserError(f"no {kind} was given: add {kind}=NAME or {kind}.path=FILE.")
-    if name in shapes.STYLES or name in shapes.SOURCES:
+    if name in shapes.names() or (kind == "style" and plugins.known(kind, name)):
         return None
     kinds = ("mesh", "image") if kind == "style" else ("mesh",)
     for each in kinds:
         if name in assets.names(each):
             return assets.find(name, each)
-    known = [*shapes.STYLES, *shapes.SOURCES, *(n for k in kinds for n in assets.names(k))]
+    known = [*shapes.names(), *(n for k in kinds for n in assets.names(k))]
     raise unknown_name(kind, name, known)
 
 

@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from styleexp import meshes
+from styleexp import meshes, plugins
 from styleexp.compose import compose
 from styleexp.errors import UserError
-from styleexp.fields import DisplacementField, zero_mean
+from styleexp.fields import zero_mean
 from styleexp.scene import Scene, prepare
 from styleexp.views import step_generator
 
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from styleexp.config import OptimConfig
+    from styleexp.fields import DisplacementField
 
 
 @dataclass
@@ -78,7 +79,8 @@ def stylize(source: str | Path, style: str | Path, *overrides: str) -> Result:
     nothing; ``save`` of what it returns does. Raises `UserError` for what the command line would
     report.
     """
-    config = compose(overrides)
+    chosen = [f"style={style}"] if plugins.known("style", str(style)) else []
+    config = compose([*chosen, *overrides])
     for part, what in ((config.source, source), (config.style, style)):
         is_file = Path(what).suffix != "" or Path(what).name != str(what)
         setattr(part, "path" if is_file else "name", str(what))
@@ -93,7 +95,9 @@ def start(scene: Scene) -> State:
     """The state before the first step: M = C."""
     optim = scene.config.optim
     generator = step_generator(optim.seed, 0, stream=7)
-    displacement_field = DisplacementField(scene.config.field, generator, scene.sigma, scene.bound)
+    displacement_field = plugins.build(
+        "field", scene.config.field, generator=generator, sigma=scene.sigma, bound=scene.bound
+    )
     displacement_field.to(scene.surface.vertices.device)
     adam = torch.optim.Adam(displacement_field.parameters(), lr=optim.rate)
     return State(displacement_field, adam)

@@ -14,6 +14,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 DEBUG = "debug=true"
+UNKNOWN_CHOICE = r"Could not find '([\w/]+)/([^'/]+)'"
+"""Hydra's words for a name that it has no option for."""
 
 
 def main() -> None:
@@ -75,6 +77,7 @@ def _hydra() -> None:
     try:
         job()
     except (HydraException, OmegaConfBaseException) as error:
+        _explain_plugin(error)
         if DEBUG in sys.argv:
             raise
         _stop(explain(error))
@@ -86,13 +89,22 @@ def _hydra() -> None:
         sys.exit(max(failures))
 
 
+def _explain_plugin(error: BaseException) -> None:
+    """Raise the `UserError` of a plugin that was chosen and can't be used, if that's the matter."""
+    from styleexp import plugins
+
+    choice = re.search(UNKNOWN_CHOICE, str(error))
+    if choice and plugins.known(choice[1], choice[2]):
+        plugins.find(choice[1], choice[2])
+
+
 def explain(error: BaseException) -> str:
     """Hydra's complaint as one or two sentences, with the nearest known name."""
     text = str(error)
     while error.__cause__ is not None:  # Hydra wraps OmegaConf's, which says more
         error = error.__cause__
         text += f"\n{error}"
-    choice = re.search(r"Could not find '([\w/]+)/([^'/]+)'", text)
+    choice = re.search(UNKNOWN_CHOICE, text)
     if choice:
         from styleexp.errors import unknown_name
 

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from styleexp.encoders.specs import ENCODERS, EncoderSpec, load_encoder
+from styleexp.encoders.specs import ENCODERS, load_encoder
 
 if TYPE_CHECKING:
     from styleexp.encoders.vgg import Encoder
 
-__all__ = ["ENCODERS", "Encoder", "EncoderSpec", "load_encoder"]
+__all__ = ["ENCODERS", "Encoder", "load_encoder"]
 
 
 def __getattr__(name: str) -> Any:

