@@ -1,6 +1,6 @@
 """Visibility from OpenGL, through EGL and so without a display; the rest is ``soft_raster``'s.
 
-OpenGL draws the index of each face into an integer image, on a GPU or, with Mesa's llvmpipe, on the
+OpenGL draws an index for each face into an integer image, on a GPU or, with Mesa's llvmpipe, on the
 CPU. Only these indices are read back, 4 bytes a pixel: OpenGL's interpolation is good to 1e-4, so
 depth and barycentric coordinates are computed anew in torch, where gradients need them anyway.
 (moderngl can't share images with CUDA; with a CUDA tensor, vertices go out and indices come in
@@ -22,7 +22,6 @@ from styleexp.renderers.soft_raster.raster import Visible
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    import numpy as np
     from jaxtyping import Float, Int
     from torch import Tensor
 
@@ -46,10 +45,11 @@ void main() {
     gl_Position = vec4(point.xy * scale - point.z, depth.x * point.z + depth.y, point.z);
 }
 """
-_FACE = """
+_PAIR = """
 #version 330
+uniform int first;
 out int id;
-void main() { id = gl_PrimitiveID; }
+void main() { id = first + gl_PrimitiveID; }
 """
 _EVERYWHERE = """
 #version 330
@@ -85,17 +85,17 @@ class ModernGLDeferred(DeferredRenderer):
         return str(_canvas().context.info["GL_RENDERER"])
 
     def find_visible(self, projected: Projected) -> Visible:
-        """Draw the faces' indices; equal depth goes to the lowest."""
-        ids = _canvas().draw(projected.points, projected.corners, projected)
-        ids = ids.to(projected.points.device, non_blocking=True).long()
-        height, width = projected.resolution
-        flat = ids.view(-1)
+        """Draw what may be seen; equal depth goes to the lowest index."""
+        device, pairs = projected.points.device, projected.pairs
+        drawn = _canvas().draw(projected).to(device, non_blocking=True)
+        flat = drawn.view(-1)
         pixel = (flat >= 0).nonzero().view(-1)
-        view = pixel // max(height * width, 1)
-        face = flat.index_select(0, pixel)
+        seen = flat.index_select(0, pixel)
+        view, face = pairs.view.index_select(0, seen), pairs.face.index_select(0, seen)
+        face_ids = pairs.face.new_full(flat.shape, -1).index_copy_(0, pixel, face)
         depth = projected.points.new_full(flat.shape, torch.inf)
         depth.index_copy_(0, pixel, _depth_at(projected, pixel, view, face))
-        return Visible(ids, depth.view(ids.shape), pixel, view, face)
+        return Visible(face_ids.view(drawn.shape), depth.view(drawn.shape), pixel, view, face)
 
 
 def _depth_at(
@@ -133,27 +133,24 @@ def _depth_at(
 
 
 class _Canvas:
-    """An OpenGL context with its programs, and the buffers of the last size."""
+    """An OpenGL context with its programs and buffers, and an image of the last size."""
 
     def __init__(self, context: Any) -> None:
         self.context = context
         self.largest = int(context.info["GL_MAX_TEXTURE_SIZE"])
-        self.faces = context.program(vertex_shader=_VERTEX, fragment_shader=_FACE)
+        self.faces = context.program(vertex_shader=_VERTEX, fragment_shader=_PAIR)
         nothing = context.program(vertex_shader=_EVERYWHERE, fragment_shader=_NOTHING)
         self.nothing = context.vertex_array(nothing, [])
-        self._corners: tuple[Tensor, int, int] | None = None
+        self.vertices = context.buffer(reserve=12, dynamic=True)
+        self.indices = context.buffer(reserve=12, dynamic=True)
+        inputs = [(self.vertices, "3f", "point")]
+        self.mesh = context.vertex_array(self.faces, inputs, self.indices, 4)
         self._image: Any = None
-        self._indices: Any = None
-        self._vertices: Any = None
-        self._mesh: Any = None
 
-    def draw(
-        self,
-        points: Float[Tensor, "3 views vertices"],
-        corners: Int[Tensor, "3 faces"],
-        projected: Projected,
-    ) -> Int[Tensor, "views height width"]:
-        """Indices of the visible faces, int32 on the CPU, -1 on the background."""
+    def draw(self, projected: Projected) -> Int[Tensor, "views height width"]:
+        """Which pair is visible: index into ``projected.pairs``, -1 on the background; int32, on
+        the CPU."""
+        points, pairs = projected.points, projected.pairs
         views, count = points.shape[1:]
         height, width = projected.resolution
         if max(height, width) > self.largest:
@@ -161,45 +158,50 @@ class _Canvas:
                 f"renderer=moderngl_deferred draws images of up to {self.largest} pixels a side "
                 f"here, not {height} x {width}: choose a lower resolution or renderer=soft_raster."
             )
-        ids = torch.full(
+        drawn = torch.full(
             (views, height, width), _UNWRITTEN, dtype=torch.int32, pin_memory=points.is_cuda
         )
-        if not corners.numel() or not ids.numel():
-            return ids.fill_(-1)
-        together = points.permute(1, 2, 0).to("cpu", torch.float32).contiguous().numpy()
-        nearest, farthest = _depth_range(points, projected.near)
+        if not pairs.face.numel() or not drawn.numel():
+            return drawn.fill_(-1)
+        corners = projected.corners.index_select(1, pairs.face) + pairs.view * count
+        triangles = corners.t().to("cpu", torch.int32).contiguous()
+        vertices = points.permute(1, 2, 0).to("cpu", torch.float32).contiguous()
+        per_view = torch.bincount(pairs.view, minlength=views)
+        ranges = _depth_ranges(points, projected.near)
         with self.context:
-            self._upload(corners, count)
-            group = max(1, min(views, self.largest // height))
-            self._resize(width, height * group)
-            for begin in range(0, views, group):
-                self._draw_group(
-                    together[begin : begin + group],
-                    list(zip(nearest, farthest, strict=True))[begin : begin + group],
-                    projected.resolution,
+            for buffer, content in ((self.vertices, vertices), (self.indices, triangles)):
+                buffer.orphan(content.numel() * 4)
+                buffer.write(content.numpy())
+            together = max(1, min(views, self.largest // height))
+            self._resize(width, height * together)
+            first = 0
+            jobs = list(zip(per_view.tolist(), ranges, strict=True))
+            for begin in range(0, views, together):
+                some = jobs[begin : begin + together]
+                first = self._draw_views(some, first, height, width)
+                self._image.read_into(
+                    drawn[begin : begin + together].numpy(),
+                    (width, height * len(some)),
+                    components=1,
+                    dtype="i4",
                 )
-                part = ids[begin : begin + group]
-                size = (width, height * len(part))
-                self._image.read_into(part.numpy(), size, components=1, dtype="i4")
-        if int(ids.min()) == _UNWRITTEN:
+        if int(drawn.min()) == _UNWRITTEN:
             raise UserError(
                 "renderer=moderngl_deferred lost its OpenGL context: another library has shut EGL "
                 "down in this process; use that library in a process of its own."
             )
-        return ids
+        return drawn
 
-    def _draw_group(
-        self,
-        points: np.ndarray,
-        ranges: list[tuple[float, float]],
-        resolution: tuple[int, int],
-    ) -> None:
-        """Draw views below one another."""
-        gl, (height, width) = self.context, resolution
-        self._image.use()
-        self._image.viewport = (0, 0, width, height * len(points))
-        self._image.scissor = None
-        self._image.clear(depth=1.0)
+    def _draw_views(
+        self, jobs: list[tuple[int, tuple[float, float]]], first: int, height: int, width: int
+    ) -> int:
+        """Draw views, given as (faces, depth range), below one another, beginning with the pair
+        ``first``; returns the pair to go on with."""
+        gl, image, uniforms = self.context, self._image, self.faces
+        image.use()
+        image.viewport = (0, 0, width, height * len(jobs))
+        image.scissor = None
+        image.clear(depth=1.0)
         # Clearing an integer image with a float colour is undefined: the background is drawn.
         gl.enable_only(gl.NOTHING)
         self.nothing.render(gl.TRIANGLES, vertices=3)
@@ -207,36 +209,17 @@ class _Canvas:
         gl.depth_func = "<"  # of equals, the first drawn stays
         gl.front_face = "cw"  # rows go down
         gl.cull_face = "back"
-        self.faces["scale"].value = (2 / width, 2 / height)
-        for view, (nearest, farthest) in enumerate(ranges):
-            window = (0, view * height, width, height)
-            self._image.viewport = self._image.scissor = window
+        uniforms["scale"].value = (2 / width, 2 / height)
+        for view, (number, (nearest, farthest)) in enumerate(jobs):
+            image.viewport = image.scissor = (0, view * height, width, height)
             span = farthest - nearest
-            self.faces["depth"].value = (
-                (farthest + nearest) / span,
-                -2 * farthest * nearest / span,
-            )
-            self._vertices.orphan()
-            self._vertices.write(points[view])
-            self._mesh.render(gl.TRIANGLES)
-        self._image.scissor = None
-
-    def _upload(self, corners: Tensor, count: int) -> None:
-        """Bring the faces to OpenGL, unless they are the last call's."""
-        indices = corners.t().to("cpu", torch.int32).contiguous()
-        key = (count, len(indices))
-        known = self._corners
-        if known is not None and known[1:] == key and torch.equal(known[0], indices):
-            return
-        for buffer in (self._mesh, self._indices, self._vertices):
-            if buffer is not None:
-                buffer.release()
-        self._indices = self.context.buffer(indices.numpy())
-        self._vertices = self.context.buffer(reserve=12 * count, dynamic=True)
-        self._mesh = self.context.vertex_array(
-            self.faces, [(self._vertices, "3f", "point")], self._indices, 4
-        )
-        self._corners = (indices, *key)
+            uniforms["depth"].value = ((farthest + nearest) / span, -2 * farthest * nearest / span)
+            uniforms["first"].value = first
+            if number:
+                self.mesh.render(gl.TRIANGLES, vertices=3 * number, first=3 * first)
+            first += number
+        image.scissor = None
+        return first
 
     def _resize(self, width: int, height: int) -> None:
         """Make an image of at least this height and just this width, unless it is there."""
@@ -251,13 +234,13 @@ class _Canvas:
         )
 
 
-def _depth_range(points: Tensor, near: float) -> tuple[list[float], list[float]]:
-    """What the depth buffer is to resolve in each view: from the near plane or the nearest vertex
-    behind it to the farthest vertex, so that its 24 bits count."""
+def _depth_ranges(points: Tensor, near: float) -> list[tuple[float, float]]:
+    """What the depth buffer is to resolve in each view: from the near plane, or the nearest vertex
+    where that is behind it, to the farthest vertex, so that its 24 bits count."""
     depth = points[2].nan_to_num(nan=near, posinf=near, neginf=near)
     nearest = (depth.amin(1) * (1 - _MARGIN)).clamp_min(near)
     farthest = torch.maximum(depth.amax(1), nearest) * (1 + _MARGIN)
-    return nearest.tolist(), farthest.tolist()
+    return list(zip(nearest.tolist(), farthest.tolist(), strict=True))
 
 
 _LOCAL = threading.local()
