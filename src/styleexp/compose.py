@@ -26,6 +26,8 @@ def register() -> None:
     for name in ENCODERS:
         store.store(group="encoder", name=name, node={"name": name})
     store.store(group="field", name="fourier_mlp", node={"name": "fourier_mlp"})
+    for name in schema.CHOICES["preview.name"]:
+        store.store(group="preview", name=name, node={"name": name})
     meshes, pictures = asset_names("mesh"), asset_names("image")
     for name in {*SOURCES, *STYLES, *meshes}:
         store.store(group="source", name=name, node={"name": name})

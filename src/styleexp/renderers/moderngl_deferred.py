@@ -278,8 +278,9 @@ def _open(create_context: Callable[..., Any]) -> Any:
     try:
         context = create_context(standalone=True, backend="egl", require=330)
     except Exception as error:  # glcontext raises plain Exceptions
+        reason = " ".join(str(error).split())
         raise UserError(
-            f"renderer=moderngl_deferred can't open OpenGL through EGL ({error}): {EGL_REMEDY}."
+            f"renderer=moderngl_deferred can't open OpenGL through EGL ({reason}): {EGL_REMEDY}."
         ) from error
     context.gc_mode = "auto"
     return context
