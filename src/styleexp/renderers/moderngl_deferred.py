@@ -72,7 +72,8 @@ class ModernGLDeferred(DeferredRenderer):
     an edge than that may go to either side: 1 pixel in 4000 on a 40k-face mesh.
 
     Raises ``UserError`` where moderngl is not installed or EGL offers no OpenGL 3.3. The context is
-    made once for each thread of a process; it can't be taken along into a forked process.
+    made once for each thread of a process; it can't be taken along into a forked process. After a
+    render no context is current: use your own, if you have one, in ``with context:``.
     """
 
     def __init__(self, visibility_gradient: str = "contour") -> None:
