@@ -69,12 +69,14 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
     import torch
 
     from styleexp import sources
+    from styleexp.config import check
     from styleexp.scene import prepare
     from styleexp.stylize import optimise, start
 
     if config.threads:
         torch.set_num_threads(config.threads)
     started = time.perf_counter()
+    check(config)
     if config.preview.name == "pyrender":
         from styleexp.previews import check_available
 
