@@ -13,6 +13,18 @@ if "STYLEEXP_ASSETS" not in os.environ and BESIDE.is_dir():
     os.environ["STYLEEXP_ASSETS"] = str(BESIDE)
 
 
+def available(make):
+    """What ``make`` returns. What it lacks, a `UserError`, is a skip, and in CI a failure."""
+    from styleexp.errors import UserError
+
+    try:
+        return make()
+    except UserError as missing:
+        if os.environ.get("CI", "") not in ("", "0", "false"):
+            pytest.fail(str(missing))
+        pytest.skip(str(missing))
+
+
 @pytest.fixture(scope="session")
 def named_mesh():
     """A function from a mesh's name to its file; skips, naming it, where it can't be found."""

@@ -23,6 +23,8 @@ def register() -> None:
     """Tell Hydra the schema, and one option for each registered name. Safe to call again."""
     store = ConfigStore.instance()
     store.store(name="base_config", node=schema.Config)
+    for name in schema.CHOICES["preview.name"]:
+        store.store(group="preview", name=name, node={"name": name})
     meshes, pictures = asset_names("mesh"), asset_names("image")
     for name in {*SOURCES, *STYLES, *meshes}:
         store.store(group="source", name=name, node={"name": name})

@@ -202,8 +202,17 @@ class OptimConfig:
 class PreviewConfig:
     """What is drawn of the result; never seen by the optimisation."""
 
+    name: str = "builtin"
+    """``builtin``: preview.png and turntable.gif. ``pyrender``: besides, an independent look at the
+    result, check.png, check.gif and check.json, for which the extra ``gl`` is needed."""
     resolution: int = 320
+    """Pixels on a side of each picture."""
     turntable_frames: int = 36
+    check_resolution: int = 640
+    """``pyrender``: pixels on a side of each picture."""
+    platform: str = "auto"
+    """``pyrender``: how it draws without a display. ``egl``, ``osmesa`` or ``auto``, EGL or else
+    OSMesa; the one used is in check.json."""
 
 
 @dataclass
@@ -243,6 +252,8 @@ CHOICES = {
     "optim.schedule": ("step", "cosine"),
     "loss.relative": ("none", "target", "source"),
     "loss.target": ("bank", "same_views"),
+    "preview.name": ("builtin", "pyrender"),
+    "preview.platform": ("auto", "egl", "osmesa"),
 }
 
 POSITIVE = (
@@ -282,6 +293,7 @@ BETWEEN = {
     "loss.erosion": (0, 64),
     "loss.relief_weight": (0.0, 1e6),
     "preview.resolution": (32, 4096),
+    "preview.check_resolution": (32, 4096),
     "threads": (0, 4096),
 }
 

@@ -1,17 +1,32 @@
-"""Pictures of a finished run: ``preview.png`` and ``turntable.gif``. Never seen by gradients."""
+"""Pictures of a finished run: ``preview.png`` and ``turntable.gif``. Never seen by gradients.
+
+With ``preview=pyrender`` there is a check view, too: the result as another renderer, in another
+process, draws it, so that a fault of the renderer that the result was made with can't hide.
+"""
 
 from __future__ import annotations
 
+import importlib.util
+import json
 import math
+import os
+import subprocess
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from styleexp import meshes
-from styleexp.renderers.base import Shading
+from styleexp.check_view import UNAVAILABLE
+from styleexp.errors import UserError
+from styleexp.renderers.base import Cameras, Renderer, Shading
 from styleexp.renderers.soft_raster import SoftRaster
 from styleexp.views import orbit, zoom
 
@@ -32,6 +47,13 @@ SUPERSAMPLING = 2
 LIGHT = (0.35, 0.45, 0.62)
 """Camera space: from above right, so that relief throws shade."""
 
+CHECK_PLATFORMS = ("egl", "osmesa")
+"""How pyrender gets at OpenGL without a display, the first choice first."""
+CHECK_TIMEOUT = 600
+"""Seconds after which a check view counts as hung."""
+LEAST_IOU = 0.98
+"""Silhouettes that agree less than this are worth a warning."""
+
 
 def render_views(
     vertices: Float[np.ndarray, "vertices 3"],
@@ -42,12 +64,8 @@ def render_views(
 ) -> np.ndarray:
     """Pictures (views, size, size), 8-bit grey, of a mesh in the unit sphere, framed tightly."""
     shading = Shading(albedo=0.8, ambient=0.22, light=LIGHT, background=1.0, normals="smooth")
-    radians = math.pi / 180
-    cameras = orbit(torch.tensor(elevations) * radians, torch.tensor(azimuths) * radians, 3.0, 40.0)
     points = torch.from_numpy(np.ascontiguousarray(vertices)).float()
-    seen = torch.einsum("nij,vj->nvi", cameras.rotation, points) + cameras.translation[:, None]
-    reach = (cameras.focal[:, None] * seen[..., :2] / -seen[..., 2:]).abs().max()
-    cameras = zoom(cameras, 0.94 / float(reach))
+    cameras = framed(points, elevations, azimuths)
     large = size * SUPERSAMPLING
     with torch.no_grad():
         out = SoftRaster().render(
@@ -59,6 +77,17 @@ def render_views(
         )
         small = torch.nn.functional.avg_pool2d(out.image.permute(0, 3, 1, 2), SUPERSAMPLING)
     return (small[:, 0].clamp(0, 1) * 255).round().byte().numpy()
+
+
+def framed(
+    points: Float[torch.Tensor, "vertices 3"], elevations: list[float], azimuths: list[float]
+) -> Cameras:
+    """Cameras around the origin, angles in degrees, zoomed alike so that all points just fit."""
+    radians = math.pi / 180
+    cameras = orbit(torch.tensor(elevations) * radians, torch.tensor(azimuths) * radians, 3.0, 40.0)
+    seen = torch.einsum("nij,vj->nvi", cameras.rotation, points) + cameras.translation[:, None]
+    reach = (cameras.focal[:, None] * seen[..., :2] / -seen[..., 2:]).abs().max()
+    return zoom(cameras, 0.94 / float(reach))
 
 
 def write_preview(result: Result, path: Path) -> None:
@@ -94,6 +123,187 @@ def write_turntable(result: Result, path: Path) -> None:
     pictures = render_views(
         generated, result.scene.source.faces, [15.0] * frames, azimuths, preview.resolution
     )
+    _write_gif(pictures, path)
+
+
+@dataclass(frozen=True)
+class CheckView:
+    """What pyrender drew."""
+
+    pictures: np.ndarray
+    """(views, size, size), 8-bit grey, by pyrender's own light."""
+    covered: np.ndarray
+    """(views, size, size), bool."""
+    platform: str
+    """``egl`` or ``osmesa``."""
+    device: str
+    """What OpenGL drew with: a GPU, or ``llvmpipe ...``."""
+
+
+def check_views(
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: np.ndarray,
+    cameras: Cameras,
+    size: int,
+    platform: str = "auto",
+) -> CheckView:
+    """Draw a mesh with pyrender, in a process of its own.
+
+    ``platform`` is ``egl``, ``osmesa`` or ``auto``, EGL or else OSMesa. Raises ``UserError`` where
+    pyrender is not installed, no platform works, or the process fails or hangs.
+    """
+    if importlib.util.find_spec("pyrender") is None:
+        raise UserError(
+            "preview=pyrender needs the package pyrender-maintained: pip install 'styleexp[gl]', "
+            "or choose preview=builtin."
+        )
+    job = {
+        "vertices": np.asarray(vertices, np.float64),
+        "faces": np.asarray(faces),
+        "near": cameras.near,
+        "size": size,
+    }
+    for name in ("rotation", "translation", "focal", "center"):
+        job[name] = getattr(cameras, name).double().cpu().numpy()
+    reasons = []
+    for chosen in CHECK_PLATFORMS if platform == "auto" else (platform,):
+        with tempfile.TemporaryDirectory(prefix="styleexp-check-") as folder:
+            reason = _run_check(job, Path(folder), chosen)
+            if reason is None:
+                with np.load(Path(folder) / "out.npz") as out:
+                    drawn = dict(out)
+                return CheckView(drawn["pictures"], drawn["covered"], chosen, str(drawn["device"]))
+        reasons.append(f"{chosen}: {reason}")
+    raise UserError(
+        f"preview=pyrender can't draw ({'; '.join(reasons)}): install OpenGL with EGL or OSMesa "
+        "(Debian, Ubuntu: apt-get install libegl1 libgl1 libopengl0 libgl1-mesa-dri libosmesa6), "
+        "or choose preview=builtin."
+    )
+
+
+def _run_check(job: dict[str, Any], folder: Path, platform: str) -> str | None:
+    """Run a job's process, whose output is then ``out.npz``; or the reason why it can't be."""
+    np.savez(folder / "in.npz", **job)
+    command = [sys.executable, "-m", "styleexp.check_view"]
+    try:
+        done = subprocess.run(
+            [*command, str(folder / "in.npz"), str(folder / "out.npz")],
+            env={**os.environ, "PYOPENGL_PLATFORM": platform},
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=CHECK_TIMEOUT,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return f"no picture after {CHECK_TIMEOUT} s"
+    if done.returncode == 0:
+        return None
+    last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+    return last if done.returncode == UNAVAILABLE else f"exit code {done.returncode}, {last}"
+
+
+def check_available(platform: str = "auto") -> None:
+    """Raise ``check_views``' ``UserError`` now rather than at the end of a run."""
+    corners = torch.eye(3)
+    check_views(
+        corners.numpy(), np.array([[0, 1, 2]]), framed(corners, [20.0], [40.0]), 32, platform
+    )
+
+
+def silhouette_iou(
+    covered: np.ndarray,
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: np.ndarray,
+    cameras: Cameras,
+    renderer: Renderer,
+    device: torch.device | str = "cpu",
+) -> tuple[list[float], np.ndarray]:
+    """How far a renderer's silhouettes agree with ``covered`` (views, size, size), bool.
+
+    Returns the intersection over the union of every view, and this renderer's pixels.
+    """
+    cameras = replace(
+        cameras,
+        rotation=cameras.rotation.to(device),
+        translation=cameras.translation.to(device),
+        focal=cameras.focal.to(device),
+        center=cameras.center.to(device),
+    )
+    with torch.no_grad():
+        out = renderer.render(
+            torch.from_numpy(np.ascontiguousarray(vertices)).float().to(device),
+            torch.from_numpy(np.ascontiguousarray(faces)).to(device),
+            cameras,
+            Shading(outlines=False),
+            (covered.shape[1], covered.shape[2]),
+        )
+    own = (out.coverage >= 0.5).cpu().numpy()
+    both, either = (own & covered).sum((1, 2)), (own | covered).sum((1, 2))
+    return np.where(either > 0, both / np.maximum(either, 1), 1.0).tolist(), own
+
+
+def write_check(result: Result, write: Callable[[str, Callable[[Path], Any]], Path]) -> list[Path]:
+    """``check.png``, ``check.gif`` and ``check.json``: the result as pyrender draws it.
+
+    ``write`` is ``RunFolder.write``. The training renderer's silhouettes are compared with
+    pyrender's at the same cameras; intersections over unions are in ``check.json``, and one below
+    ``LEAST_IOU`` is a warning. Returns the files' paths.
+    """
+    scene, preview = result.scene, result.scene.config.preview
+    faces = scene.source.faces
+    vertices = scene.frame.apply(result.vertices)
+    points = torch.from_numpy(np.ascontiguousarray(vertices)).float()
+    frames = preview.turntable_frames
+    elevations = [v[1] for v in VIEWS] + [15.0] * frames
+    azimuths = [v[2] for v in VIEWS] + [360.0 * i / frames for i in range(frames)]
+    cameras = framed(points, elevations, azimuths)
+    size, views = preview.check_resolution, slice(0, len(VIEWS))
+    drawn = check_views(vertices, faces, cameras, size, preview.platform)
+    ious, own = silhouette_iou(
+        drawn.covered[views],
+        vertices,
+        faces,
+        cameras[views],
+        scene.viewer.renderer,
+        scene.surface.vertices.device,
+    )
+
+    name = scene.config.renderer.name
+    found = {
+        "least_iou": min(ious),
+        "views": [
+            {"view": label, "elevation": elevation, "azimuth": azimuth, "iou": iou}
+            for (label, elevation, azimuth), iou in zip(VIEWS, ious, strict=True)
+        ],
+        "renderer": name,
+        "check": f"pyrender, {drawn.platform}, {drawn.device}",
+        "resolution": size,
+    }
+    if min(ious) < LEAST_IOU:
+        warnings.warn(
+            "the result looks different in the check view: its silhouette seen from the "
+            f"{VIEWS[ious.index(min(ious))][0]} agrees with {name}'s to {min(ious):.3f} (IoU), "
+            f"{LEAST_IOU} is expected; see check.png.",
+            stacklevel=2,
+        )
+    agreed = ", ".join(f"{iou:.4f}" for iou in ious)
+    rows = [
+        (f"result, drawn by pyrender ({drawn.platform})", drawn.pictures[views]),
+        (
+            f"black where {name} disagrees; IoU {agreed}",
+            np.where(own != drawn.covered[views], 0, np.where(own, 200, 255)).astype(np.uint8),
+        ),
+    ]
+    sheet = [(label, [Image.fromarray(p) for p in pictures]) for label, pictures in rows]
+    return [
+        write("check.json", lambda path: path.write_text(json.dumps(found, indent=2) + "\n")),
+        write("check.png", lambda path: _sheet(sheet, size).save(path)),
+        write("check.gif", lambda path: _write_gif(drawn.pictures[len(VIEWS) :], path)),
+    ]
+
+
+def _write_gif(pictures: np.ndarray, path: Path) -> None:
     first, *rest = [Image.fromarray(p) for p in pictures]
     first.save(path, save_all=True, append_images=rest, duration=80, loop=0, optimize=True)
 

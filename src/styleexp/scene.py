@@ -34,7 +34,7 @@ BOUND_MARGIN = 2.0
 """How much farther than the style's own relief the displacement may reach."""
 
 PICTURE_RELIEF = 0.05
-"""Half the range of a picture's relief and its bound, in radii: a picture doesn't tell its height."""
+"""Half the range of a picture's relief, and its bound, in radii: a picture doesn't tell them."""
 
 PICTURE_DETAIL = 128
 """Pixels on a picture's longer side when its frequency is measured; finer detail doesn't count."""

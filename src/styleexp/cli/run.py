@@ -72,12 +72,18 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
     import torch
 
     from styleexp import sources
+    from styleexp.config import check
     from styleexp.scene import prepare
     from styleexp.stylize import optimise, start
 
     if config.threads:
         torch.set_num_threads(config.threads)
     started = time.perf_counter()
+    check(config)
+    if config.preview.name == "pyrender":
+        from styleexp.previews import check_available
+
+        check_available(config.preview.platform)
     scene = prepare(config)
     for note in scene.notes:
         print(f"note: {note}")
@@ -127,7 +133,10 @@ def _write_results(scene: Scene, state: State, folder: records.RunFolder) -> lis
     folder.write("preview.png", lambda path: previews.write_preview(result, path))
     folder.write("turntable.gif", lambda path: previews.write_turntable(result, path))
     names = ("preview.png", "turntable.gif", "result.glb", "result.ply", "result.obj")
-    return [folder.path / name for name in names]
+    written = [folder.path / name for name in names]
+    if scene.config.preview.name == "pyrender":
+        written += previews.write_check(result, folder.write)
+    return written
 
 
 @contextmanager

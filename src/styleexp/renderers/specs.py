@@ -20,10 +20,25 @@ class SoftRasterConfig:
     """``contour`` (outlines are anti-aliased and carry gradients) or ``none``."""
 
 
+@dataclass
+class ModernGLDeferredConfig:
+    """Options of ``moderngl_deferred``."""
+
+    name: str = "moderngl_deferred"
+    visibility_gradient: str = "contour"
+    """As for ``soft_raster``."""
+
+
 def _soft_raster(config: SoftRasterConfig) -> Renderer:
     from styleexp.renderers.soft_raster import SoftRaster
 
     return SoftRaster(visibility_gradient=config.visibility_gradient)
+
+
+def _moderngl_deferred(config: ModernGLDeferredConfig) -> Renderer:
+    from styleexp.renderers.moderngl_deferred import ModernGLDeferred
+
+    return ModernGLDeferred(visibility_gradient=config.visibility_gradient)
 
 
 RENDERERS = {
@@ -32,5 +47,13 @@ RENDERERS = {
         "pure-torch rasteriser with contour-edge visibility gradients; CPU and CUDA",
         SoftRasterConfig,
         _soft_raster,
+    ),
+    "moderngl_deferred": Spec(
+        "moderngl_deferred",
+        "faces found by OpenGL through EGL, the rest as soft_raster; needs the extra gl",
+        ModernGLDeferredConfig,
+        _moderngl_deferred,
+        requires=("moderngl",),
+        extra="gl",
     ),
 }

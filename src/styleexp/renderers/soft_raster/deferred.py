@@ -1,0 +1,141 @@
+"""Deferred rendering: find out which face is seen where, then shade and anti-alias only that.
+
+Finding out (``DeferredRenderer.find_visible``) is not differentiated, and is all that the backends
+built on this differ in; light, outlines and every gradient are theirs in common.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+
+from styleexp.errors import unknown_name
+from styleexp.renderers.base import Cameras, Capabilities, Renderer, RenderOutput, Shading
+from styleexp.renderers.soft_raster.contour import (
+    Blend,
+    CrossingDistance,
+    find_crossings,
+    neighbours,
+)
+from styleexp.renderers.soft_raster.geometry import FaceNormals, Project, pixel_projection
+from styleexp.renderers.soft_raster.raster import candidate_pairs, facing
+from styleexp.renderers.soft_raster.shading import FlatSurface, SmoothSurface, world_light
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+    from torch import Tensor
+
+    from styleexp.renderers.soft_raster.raster import FacePairs, Visible
+
+VISIBILITY_GRADIENTS = ("contour", "none")
+
+
+@dataclass(frozen=True)
+class Projected:
+    """A mesh on the screens of all views: what visibility is found from. Without gradients."""
+
+    points: Float[Tensor, "3 views vertices"]
+    """Homogeneous pixels ``(column w, row w, w)``; see ``pixel_projection``."""
+    corners: Int[Tensor, "3 faces"]
+    pairs: FacePairs
+    """The faces that each view may see; all others can be left out."""
+    near: float
+    """Nothing nearer than this, in world units along the viewing axis, is seen."""
+    resolution: tuple[int, int]
+    """(height, width) in pixels."""
+
+
+class DeferredRenderer(Renderer):
+    """Hard visibility, exact shading gradients, contour-edge visibility gradients.
+
+    ``visibility_gradient`` is ``contour`` (outlines are anti-aliased and carry the gradient of what
+    covers what) or ``none`` (hard outlines; the gradient is that of shading alone). Grey images
+    (one channel), float32 or float64 after the vertices, any device that torch knows. Raises
+    ``UserError`` for an unknown ``visibility_gradient`` or ``Shading.normals``.
+
+    Against finite differences of an 8 times supersampled render, gradients of smoothly shaded
+    images and of coverage are within 10 %. Those of flat shaded images lack one thing: the borders
+    between neighbouring faces' grey levels move too, and only outlines are accounted for here.
+    ``capabilities`` are those of ``contour``.
+    """
+
+    capabilities = Capabilities(
+        differentiable_shading=True, differentiable_visibility=True, devices=("cpu", "cuda")
+    )
+
+    def __init__(self, visibility_gradient: str = "contour") -> None:
+        if visibility_gradient not in VISIBILITY_GRADIENTS:
+            raise unknown_name("visibility gradient", visibility_gradient, VISIBILITY_GRADIENTS)
+        self.visibility_gradient = visibility_gradient
+        self._known: tuple[Tensor, int, Tensor] | None = None
+
+    @abstractmethod
+    def find_visible(self, projected: Projected) -> Visible:
+        """The nearest front face at every pixel centre. Called with gradients off."""
+
+    def render(
+        self,
+        vertices: Float[Tensor, "vertices 3"],
+        faces: Int[Tensor, "faces 3"],
+        cameras: Cameras,
+        shading: Shading,
+        resolution: tuple[int, int],
+    ) -> RenderOutput:
+        """Render one mesh from every camera; see ``Renderer.render``."""
+        if shading.normals not in ("flat", "smooth"):
+            raise unknown_name("kind of normals", shading.normals, ("flat", "smooth"))
+        corners = faces.t().contiguous().long()
+
+        points = Project.apply(vertices, pixel_projection(cameras, resolution, vertices))
+        face_normals = FaceNormals.apply(vertices, corners)
+
+        with torch.no_grad():
+            front = facing(vertices, corners, face_normals, _eyes(cameras, vertices))
+            pairs = candidate_pairs(points, corners, front, cameras.near, resolution)
+            visible = self.find_visible(
+                Projected(points.detach(), corners, pairs, cameras.near, resolution)
+            )
+
+        light = world_light(cameras, shading, vertices)
+        surface: FlatSurface | SmoothSurface
+        if shading.normals == "flat":
+            surface = FlatSurface(face_normals, light, shading)
+        else:
+            surface = SmoothSurface(points, face_normals, corners, light, shading)
+        intensities = surface.at_pixels(visible)
+        background = vertices.new_full((visible.depth.numel(),), shading.background)
+        image = background.index_copy(0, visible.pixel, intensities)
+        coverage = (visible.face_ids >= 0).to(vertices.dtype).view(-1)
+
+        if self.visibility_gradient == "contour" and shading.outlines:
+            across = self._neighbours(faces, vertices.shape[0])
+            edges = find_crossings(points, corners, across, front, pairs, visible, cameras.near)
+            distance = CrossingDistance.apply(points, edges)
+            colour = surface.at_crossings(edges)
+            image, coverage = Blend.apply(
+                torch.stack([image, coverage]),
+                distance,
+                torch.stack([colour, torch.ones_like(colour)]),
+                edges.inner,
+                edges.outer,
+            )
+
+        shape = visible.depth.shape
+        return RenderOutput(
+            image.view(*shape, 1), coverage.view(shape), visible.face_ids, visible.depth
+        )
+
+    def _neighbours(self, faces: Tensor, count: int) -> Int[Tensor, "3 faces"]:
+        """Faces across edges; remembered, since a fit renders the same topology many times."""
+        if self._known is None or self._known[0] is not faces or self._known[1] != faces._version:
+            self._known = (faces, faces._version, neighbours(faces.long(), count))
+        return self._known[2]
+
+
+def _eyes(cameras: Cameras, like: Tensor) -> Float[Tensor, "views 3"]:
+    """Positions of the cameras in the world."""
+    rotation, translation = cameras.rotation.to(like), cameras.translation.to(like)
+    return -(rotation * translation[:, :, None]).sum(1)
