@@ -1,7 +1,7 @@
 """Finds an LLVM for Mitsuba's CPU variant, and tries it where a crash does no harm.
 
-A wrong LLVM is accepted when Mitsuba starts and aborts the whole process at the first render. So
-one is tried first in a process of its own, once in each process that wants it.
+Mitsuba accepts a wrong LLVM when it starts and then aborts the whole process at the first render.
+So the LLVM is tried in a process of its own first.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ PATH = "DRJIT_LIBLLVM_PATH"
 
 _WHEEL = "karellen-llvm-core"
 _INSTALL = "pip install 'styleexp[mitsuba]'"
-_TIMEOUT = 120.0
+_OLDEST = 19  # that is known to work; 15 and 16 abort, 14 is refused
+_TIMEOUT = 120.0  # seconds
 
 # Traces one ray to a mesh, which is where a wrong LLVM aborts, and differentiates it.
 _TRIAL = f"""
@@ -45,10 +46,10 @@ assert abs(hit.t[0] - 4) < 1e-4 and drjit.max(drjit.abs(drjit.grad(parameters[ke
 def prepare() -> None:
     """Make sure that ``import mitsuba`` followed by ``set_variant(VARIANT)`` will work.
 
-    Sets ``DRJIT_LIBLLVM_PATH`` for this process, where it is not set, to the library of the wheel
-    that comes with the extra ``mitsuba``; without the wheel Dr.Jit looks for the system's. Raises
-    ``UserError`` where a package is missing, or where the trial fails. Takes a second or two, once
-    a process.
+    Where ``DRJIT_LIBLLVM_PATH`` is not set, sets it for this process and those it starts to the
+    library of the wheel that the extra ``mitsuba`` brings; without the wheel Dr.Jit looks for the
+    system's. A path that is set is kept, whatever it names. Raises ``UserError`` where a package is
+    missing or the trial fails. Takes half a second, once a process.
     """
     for package in ("drjit", "mitsuba"):
         if importlib.util.find_spec(package) is None:
@@ -56,19 +57,24 @@ def prepare() -> None:
                 f"renderer=mitsuba_ad needs the package '{package}', which is not installed: "
                 f"{_INSTALL}."
             )
-    if not os.environ.get(PATH):
-        library = from_wheel()
-        if library is not None:
-            os.environ[PATH] = str(library)
+    given = os.environ.get(PATH)
+    library = None if given else from_wheel()
+    if library is not None:
+        os.environ[PATH] = str(library)
     problem = _try()
-    if problem is not None:
-        chosen = os.environ.get(PATH)
-        which = f"the LLVM that {PATH} names, '{chosen}'," if chosen else "the LLVM found, if any,"
-        fix = f"unset {PATH} and {_INSTALL}" if chosen else _INSTALL
+    if problem is None:
+        return
+    if given:
         raise UserError(
-            f"renderer=mitsuba_ad can't use {which} ({problem}): {fix}, which brings one that "
-            f"works, or set {PATH} to the libLLVM.so of LLVM 17 or newer."
+            f"renderer=mitsuba_ad can't use the LLVM that {PATH} names, '{given}' ({problem}): "
+            f"unset {PATH} to use the one that {_INSTALL} brings on Linux x86-64, or name the "
+            f"libLLVM.so of LLVM {_OLDEST} or newer."
         )
+    which = f"the LLVM of {_WHEEL}, '{library}'" if library else "an LLVM of the system's"
+    raise UserError(
+        f"renderer=mitsuba_ad can't use {which} ({problem}): {_INSTALL}, which brings a working "
+        f"one on Linux x86-64, or name the libLLVM.so of LLVM {_OLDEST} or newer in {PATH}."
+    )
 
 
 def from_wheel() -> Path | None:
@@ -100,5 +106,7 @@ def _try() -> str | None:
         return None
     if trial.returncode < 0:
         return f"a trial render was ended by signal {-trial.returncode}"
+    if "LLVM backend is inactive" in trial.stderr:
+        return "Dr.Jit can't load it"
     lines = [line.strip() for line in trial.stderr.splitlines() if line.strip()]
-    return lines[-1] if lines else f"a trial render failed with exit code {trial.returncode}"
+    return lines[-1].rstrip(".") if lines else f"a trial render gave {trial.returncode}"

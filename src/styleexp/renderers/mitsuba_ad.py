@@ -47,11 +47,12 @@ class MitsubaAD(Renderer):
     noise, and gradients are those of shading alone.
 
     Grey images (one channel), float32 inside. ``face_ids`` and ``depth`` are what pixel centres
-    see. Raises ``UserError`` where Mitsuba or a working LLVM is missing, for sample counts below
-    one, for vertices that are not on the CPU, and for an unknown ``Shading.normals``.
+    see. Raises ``UserError`` where Mitsuba or a working LLVM is missing, for counts or a seed out
+    of range, for vertices that are not on the CPU, and for an unknown ``Shading.normals``.
 
-    As in ``soft_raster``, the borders between the grey levels of flat shaded faces move without
-    showing in the gradient. Where two faces lie in the same place, either may be seen.
+    As in ``soft_raster``, the gradient leaves out that the borders between the grey levels of flat
+    shaded faces move. Where two faces lie in the same place, either may be seen. Gradients are sums
+    in whatever order the threads come: their last bits vary.
     """
 
     capabilities = Capabilities(
@@ -65,6 +66,8 @@ class MitsubaAD(Renderer):
         for name, count in (("spp", spp), ("sppc", sppc), ("sppp", sppp)):
             if count < 1:
                 raise UserError(f"renderer.{name}={count} is too few: give at least 1.")
+        if not 0 <= seed < 1 << 32:
+            raise UserError(f"renderer.seed={seed} is out of range: give 0 to {(1 << 32) - 1}.")
         _mitsuba()
         self.spp, self.sppc, self.sppp, self.seed = spp, sppc, sppp, seed
 
@@ -168,9 +171,7 @@ def _draw(
         scene = mi.load_dict({"type": "scene", "mesh": mesh})
         integrator = _integrator()(mesh, f"{of}_n", picture)
         sensor = _sensor(picture)
-        color = mi.render(
-            scene, parameters, sensor, integrator, picture.seed, ~picture.seed & 0xFFFFFFFF
-        )
+        color = mi.render(scene, parameters, sensor, integrator, picture.seed)
         return color, *_centres(scene, picture)
 
     color, face, depth = trace(points.contiguous(), faces.int().contiguous(), normals.contiguous())
@@ -288,6 +289,14 @@ def _integrator() -> type:
         def next_2d(self, active: bool = True) -> Any:
             return mi.Point2f(0.5)
 
+    class Silhouette(mi.ad.ProjectiveDetail):
+        """Samples of outlines whose mesh is data, not a number compiled into the kernels."""
+
+        def sample_primarily_visible_silhouette(self, *arguments: Any) -> Any:
+            sample = super().sample_primarily_visible_silhouette(*arguments)
+            sample.shape = dr.opaque(mi.ShapePtr, self.parent.mesh)
+            return sample
+
     class Emitted(DirectProjectiveIntegrator):
         """``direct_projective`` of surfaces that emit the shared shading."""
 
@@ -296,6 +305,7 @@ def _integrator() -> type:
             _, self.sppc, self.sppp = picture.samples
             self.sppi = 0  # nothing is seen indirectly, and guiding it takes seconds and gigabytes
             self.mesh, self.attribute = mesh, attribute
+            self.proj_detail = Silhouette(self)
             self.at_centre = not picture.shading.outlines
             # Opaque: numbers that change must not be compiled into the kernels.
             self.light = mi.Vector3f(*(dr.opaque(mi.Float, part) for part in picture.light))
@@ -332,11 +342,8 @@ def _integrator() -> type:
             with dr.resume_grad(when=mode != dr.ADMode.Primal):
                 if si_shade is None:
                     hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-                    # Not by the intersection's own method, which is dispatched over all meshes.
                     active = hit.is_valid() & active
-                    si_shade = self.mesh.compute_surface_interaction(
-                        ray, hit, mi.RayFlags.All, active
-                    )
+                    si_shade = self.at(hit, ray, active)
                 normal = self.mesh.eval_attribute_3(self.attribute, si_shade, active)
                 squared = dr.squared_norm(normal)
                 lit = dr.dot(normal, self.light) * dr.rsqrt(dr.select(squared > 0, squared, 1))
@@ -345,5 +352,28 @@ def _integrator() -> type:
                     dr.select(active, intensity, self.background), dr.select(active, 1.0, 0.0), 0
                 )
             return color, active, [], None
+
+        def sample_radiance_difference(
+            self, scene: Any, ss: Any, depth: Any, sampler: Any, wavelengths: Any, active: Any
+        ) -> tuple[Any, Any]:
+            primal = dr.ADMode.Primal
+            ray = ss.spawn_ray(wavelengths)
+            background, *_ = self.sample(primal, scene, sampler, ray, depth, active=active)
+            hit = dr.zeros(mi.PreliminaryIntersection3f)
+            hit.t, hit.prim_index, hit.prim_uv = 1, ss.prim_index, ss.uv
+            surface = self.at(hit, mi.Ray3f(ss.p - ss.d, ss.d), active)
+            foreground, *_ = self.sample(
+                primal, scene, sampler, ray, depth, active=active, si_shade=surface
+            )
+            difference = foreground - background
+            return difference, active & dr.any(difference != 0)
+
+        def at(self, hit: Any, ray: Any, active: Any) -> Any:
+            """The surface that a ray hits.
+
+            An intersection's own method is dispatched over all meshes alive, and its kernels are
+            compiled anew whenever their number changes.
+            """
+            return self.mesh.compute_surface_interaction(ray, hit, mi.RayFlags.All, active)
 
     return Emitted
