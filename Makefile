@@ -43,5 +43,5 @@ $(VENV)/.installed: pyproject.toml $(wildcard constraints.txt) | $(BIN)/python
 	@touch $@
 
 $(VENV)/.installed-dev: pyproject.toml $(wildcard constraints.txt) | $(BIN)/python
-	$(PIP) --editable '.[dev,gl]'
+	$(PIP) --editable '.[dev,all]'
 	@touch $@ $(VENV)/.installed

@@ -97,6 +97,9 @@ class Capabilities:
     differentiable_shading: bool
     differentiable_visibility: bool
     devices: tuple[str, ...] = ("cpu",)
+    decides_ties: bool = True
+    """Whether a pixel centre right on an edge belongs to exactly one of the faces that share it,
+    and of faces in the very same place the first is seen. Ray tracers can't promise it."""
 
 
 class Renderer(ABC):

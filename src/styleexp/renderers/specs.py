@@ -41,6 +41,27 @@ def _moderngl_deferred(config: ModernGLDeferredConfig) -> Renderer:
     return ModernGLDeferred(visibility_gradient=config.visibility_gradient)
 
 
+@dataclass
+class MitsubaADConfig:
+    """Options of ``mitsuba_ad``. Counts are samples per pixel, used where outlines are soft."""
+
+    name: str = "mitsuba_ad"
+    spp: int = 16
+    """Of the picture, rounded up to a number that divides a pixel evenly."""
+    sppc: int = 4
+    """Of the gradient of shading."""
+    sppp: int = 1
+    """Of the gradient of outlines; they are spread over the outlines, not over the pixels."""
+    seed: int = 0
+    """Of all samples; every render starts from it anew."""
+
+
+def _mitsuba_ad(config: MitsubaADConfig) -> Renderer:
+    from styleexp.renderers.mitsuba_ad import MitsubaAD
+
+    return MitsubaAD(config.spp, config.sppc, config.sppp, config.seed)
+
+
 RENDERERS = {
     "soft_raster": Spec(
         "soft_raster",
@@ -55,5 +76,13 @@ RENDERERS = {
         _moderngl_deferred,
         requires=("moderngl",),
         extra="gl",
+    ),
+    "mitsuba_ad": Spec(
+        "mitsuba_ad",
+        "Mitsuba 3, path-space gradients of outlines; CPU, extra 'mitsuba'",
+        MitsubaADConfig,
+        _mitsuba_ad,
+        requires=("mitsuba", "drjit"),
+        extra="mitsuba",
     ),
 }
