@@ -289,7 +289,10 @@ def write_check(result: Result, write: Callable[[str, Callable[[Path], Any]], Pa
         )
     agreed = ", ".join(f"{iou:.4f}" for iou in ious)
     rows = [
-        (f"result, drawn by pyrender ({drawn.platform})", drawn.pictures[views]),
+        (
+            f"result, drawn by pyrender ({drawn.platform}): {', '.join(v[0] for v in VIEWS)}",
+            drawn.pictures[views],
+        ),
         (
             f"black where {name} disagrees; IoU {agreed}",
             np.where(own != drawn.covered[views], 0, np.where(own, 200, 255)).astype(np.uint8),
