@@ -154,7 +154,7 @@ def check_views(
     """
     if importlib.util.find_spec("pyrender") is None:
         raise UserError(
-            "preview=pyrender needs the package pyrender-maintained: pip install 'styleexp[gl]', "
+            "preview=pyrender needs the package pyrender-maintained: pip install pyrender-maintained, "
             "or choose preview=builtin."
         )
     job = {

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from torch import Tensor
 
-PACKAGES_REMEDY = "pip install 'styleexp[gl]'"
+PACKAGES_REMEDY = "pip install moderngl glcontext"
 EGL_REMEDY = (
     "install OpenGL and EGL (Debian, Ubuntu: apt-get install libegl1 libgl1 libgl1-mesa-dri) or "
     "choose renderer=soft_raster"
