@@ -44,12 +44,11 @@ _LANES = 1 << 22  # rays that are traced together: bounds the memory
 class MitsubaAD(Renderer):
     """Path-space differentiable rendering on the CPU, by Mitsuba's ``direct_projective``.
 
-    With ``Shading.outlines`` a pixel is the mean of ``spp`` samples spread over its area (its
-    centre's colour if that is one). Gradients
-    are sampled too: ``sppc`` times a pixel for shading, and ``sppp`` times the number of pixels
-    along outlines. Everything is drawn from ``seed`` anew in every call and for every view: the
-    same input gives the same picture. Without outlines a pixel is what its centre sees; there is no
-    noise, and gradients are those of shading alone.
+    With ``Shading.outlines`` a pixel is the mean of ``spp`` samples spread over its area, or with
+    one sample its centre's colour. Gradients are sampled too: ``sppc`` times a pixel for shading,
+    and ``sppp`` times the number of pixels along outlines. Everything is drawn from ``seed`` anew
+    in every call and for every view: the same input gives the same picture. Without outlines a
+    pixel is what its centre sees; there is no noise, and gradients are those of shading alone.
 
     Grey images (one channel), float32 inside. ``face_ids`` and ``depth`` are what pixel centres
     see. Raises ``UserError`` where Mitsuba or a working LLVM is missing, for counts or a seed out
