@@ -154,8 +154,8 @@ def check_views(
     """
     if importlib.util.find_spec("pyrender") is None:
         raise UserError(
-            "preview=pyrender needs the package pyrender-maintained: pip install pyrender-maintained, "
-            "or choose preview=builtin."
+            "preview=pyrender needs a package: pip install pyrender-maintained, or choose "
+            "preview=builtin."
         )
     job = {
         "vertices": np.asarray(vertices, np.float64),

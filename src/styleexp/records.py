@@ -25,7 +25,16 @@ if TYPE_CHECKING:
 SCHEMA = 1
 """Version of the run folder's layout."""
 
-PACKAGES = ("styleexp", "torch", "numpy", "trimesh", "hydra-core", "omegaconf", "safetensors")
+PACKAGES = (
+    "styleexp",
+    "torch",
+    "numpy",
+    "trimesh",
+    "hydra-core",
+    "omegaconf",
+    "safetensors",
+    "mitsuba",
+)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ PATH = "DRJIT_LIBLLVM_PATH"
 """The environment variable by which Dr.Jit is told of an LLVM."""
 
 _WHEEL = "karellen-llvm-core"
-_INSTALL = "pip install 'styleexp[mitsuba]'"
+_INSTALL = "pip install mitsuba drjit karellen-llvm-core"
 _OLDEST = 19  # that is known to work; 15 and 16 abort, 14 is refused
 _TIMEOUT = 120.0  # seconds
 

@@ -47,9 +47,9 @@ class MitsubaADConfig:
 
     name: str = "mitsuba_ad"
     spp: int = 16
-    """Of the picture, rounded up to a number that divides a pixel evenly."""
+    """Of the picture, rounded up to a number that can be spread evenly; 1 is the pixel's centre."""
     sppc: int = 4
-    """Of the gradient of shading."""
+    """Of the gradient of shading, rounded likewise."""
     sppp: int = 1
     """Of the gradient of outlines; they are spread over the outlines, not over the pixels."""
     seed: int = 0
