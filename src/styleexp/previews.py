@@ -111,7 +111,7 @@ def write_preview(result: Result, path: Path) -> None:
         rows.append((f"style: {Path(chosen.path or str(chosen.name)).stem}", [picture]))
     generated = scene.frame.apply(result.vertices)
     rows.append(("result", shown(generated, scene.source.faces)))
-    _sheet(rows, size).save(path)
+    sheet(rows, size).save(path)
 
 
 def write_turntable(result: Result, path: Path) -> None:
@@ -298,10 +298,10 @@ def write_check(result: Result, write: Callable[[str, Callable[[Path], Any]], Pa
             np.where(own != drawn.covered[views], 0, np.where(own, 200, 255)).astype(np.uint8),
         ),
     ]
-    sheet = [(label, [Image.fromarray(p) for p in pictures]) for label, pictures in rows]
+    drawn_rows = [(label, [Image.fromarray(p) for p in pictures]) for label, pictures in rows]
     return [
         write("check.json", lambda path: path.write_text(json.dumps(found, indent=2) + "\n")),
-        write("check.png", lambda path: _sheet(sheet, size).save(path)),
+        write("check.png", lambda path: sheet(drawn_rows, size).save(path)),
         write("check.gif", lambda path: _write_gif(drawn.pictures[len(VIEWS) :], path)),
     ]
 
@@ -311,7 +311,8 @@ def _write_gif(pictures: np.ndarray, path: Path) -> None:
     first.save(path, save_all=True, append_images=rest, duration=80, loop=0, optimize=True)
 
 
-def _sheet(rows: list[tuple[str, list[Image.Image]]], size: int) -> Image.Image:
+def sheet(rows: list[tuple[str, list[Image.Image]]], size: int) -> Image.Image:
+    """Labelled rows of pictures, none larger than ``size``, under each other."""
     band = max(18, size // 12)
     font = ImageFont.load_default(size=band * 0.62)
     columns = max(len(pictures) for _, pictures in rows)

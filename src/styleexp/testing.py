@@ -705,3 +705,31 @@ def _assert_supersampled(renderer: Renderer, field: Callable[[Tensor], Tensor]) 
     with torch.no_grad():
         change = total(vertices + step * direction, 8) - total(vertices - step * direction, 8)
     _assert_near(float((gradient * direction).sum()), float(change) / (2 * step), 0.1)
+
+
+def conformance_table() -> str:
+    """Markdown: every check for every registered renderer, with the reason of each that is no pass.
+
+    ``python -c "from styleexp import testing; print(testing.conformance_table())"``
+    """
+    from styleexp import plugins
+
+    names, columns, reasons = [], [], []
+    for choice in plugins.everything():
+        if choice.kind != "renderer":
+            continue
+        renderer = plugins.build("renderer", choice.spec.config(name=choice.name))
+        names.append(choice.name)
+        outcomes = check_renderer(renderer)
+        columns.append(outcomes)
+        reasons += [
+            f"- `{choice.name}`, {check.replace('_', ' ')}: {outcome}"
+            for check, outcome in outcomes.items()
+            if outcome != "passed"
+        ]
+    lines = ["| check | " + " | ".join(f"`{n}`" for n in names) + " |"]
+    lines.append("| --- |" + " --- |" * len(names))
+    for check in CHECKS:
+        marks = ["yes" if c[check.__name__] == "passed" else "n/a" for c in columns]
+        lines.append(f"| {check.__name__.replace('_', ' ')} | " + " | ".join(marks) + " |")
+    return "\n".join([*lines, "", *reasons])

@@ -1,0 +1,141 @@
+"""What the renderer changes: the runs of one sweep side by side, compared with the first.
+
+``+experiment=backend_agreement`` writes ``figure.png`` (a row of views for each run, and their
+absolute difference from the first run's), ``agreement.json`` and a table on the terminal.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hydra.experimental.callback import Callback
+
+if TYPE_CHECKING:
+    import numpy as np
+    from omegaconf import DictConfig
+
+DIFFERENCE_GAIN = 4
+"""How much darker than they are differences are drawn."""
+
+
+class OnSweepEnd(Callback):
+    """Hydra's callback: compare when all jobs are over."""
+
+    def on_multirun_end(self, config: DictConfig, **rest: Any) -> None:
+        """Compare the runs in the sweep's folder; those that failed are listed as failed."""
+        folder = Path(config.hydra.sweep.dir)
+        rows = compare(folder)
+        (folder / "agreement.json").write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+        _print_table(rows, folder)
+
+
+def compare(folder: Path) -> list[dict[str, Any]]:
+    """One row for each run below ``folder``, in the order of the jobs; draws ``figure.png``.
+
+    ``distance`` is the root mean square distance of the result's vertices from the first run's, as
+    a share of the first's root mean square displacement; ``correlation`` that of both
+    displacements; ``picture`` the mean absolute difference of four views, in [0, 1]. ``loss`` is
+    the mean of the last tenth of the steps, each measured by the run's own renderer.
+    """
+    import numpy as np
+
+    rows, results = [], []
+    runs = [path.parent for path in folder.glob("*/run.json")]
+    for run in sorted(runs, key=lambda path: (len(path.name), path.name)):
+        record = json.loads((run / "run.json").read_text(encoding="utf-8"))
+        status = json.loads((run / "status.json").read_text(encoding="utf-8"))
+        row = {
+            "run": run.name,
+            "renderer": record["config"]["renderer"]["name"],
+            "status": status["status"],
+        }
+        rows.append(row)
+        if status["status"] != "done":
+            row["reason"] = status.get("reason", "")
+            continue
+        lines = (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
+        steps = [json.loads(line) for line in lines]
+        row["seconds_per_step"] = statistics.median(s["seconds"] for s in steps)
+        row["loss"] = statistics.fmean(s["loss"] for s in steps[-max(1, len(steps) // 10) :])
+        results.append((row, *_result(run / "result.ply")))
+    if not results:
+        return rows
+
+    _, first, faces, displacement = results[0]
+    pictures = []
+    for row, vertices, _, other in results:
+        pictures.append((row, _views(first, vertices, faces)))
+        gap = np.linalg.norm(vertices - first, axis=1)
+        scale = max(float(np.sqrt((displacement**2).mean())), 1e-12)
+        row["distance"] = float(np.sqrt((gap**2).mean())) / scale
+        row["correlation"] = float(np.corrcoef(displacement, other)[0, 1])
+        difference = np.abs(pictures[-1][1].astype(float) - pictures[0][1].astype(float))
+        row["picture"] = float(difference.mean() / 255)
+    _draw(pictures, folder / "figure.png")
+    return rows
+
+
+def _result(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices, faces and displacement of a result, as they stand in its file."""
+    import numpy as np
+    import trimesh
+
+    mesh = trimesh.load(path, process=False)
+    stored = mesh.metadata["_ply_raw"]["vertex"]["data"]  # where trimesh keeps custom properties
+    displacement = np.asarray(stored["displacement"], dtype=float).ravel()
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces), displacement
+
+
+def _views(first: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    from styleexp import meshes, previews
+
+    frame = meshes.normalisation(first)
+    elevations, azimuths = [v[1] for v in previews.VIEWS], [v[2] for v in previews.VIEWS]
+    return previews.render_views(frame.apply(vertices), faces, elevations, azimuths, 320)
+
+
+def _draw(pictures: list[tuple[dict[str, Any], np.ndarray]], path: Path) -> None:
+    import numpy as np
+    from PIL import Image
+
+    from styleexp.previews import sheet
+
+    rows = []
+    reference = pictures[0][1].astype(float)
+    for row, views in pictures:
+        rows.append((f"{row['renderer']}: result", [Image.fromarray(v) for v in views]))
+        if len(rows) > 1:
+            gap = 255 - DIFFERENCE_GAIN * np.abs(views.astype(float) - reference)
+            dark = [Image.fromarray(v) for v in gap.clip(0, 255).astype(np.uint8)]
+            label = f"{row['renderer']}: difference from {pictures[0][0]['renderer']}"
+            rows.append((f"{label}, {DIFFERENCE_GAIN} times as dark", dark))
+    sheet(rows, views.shape[1]).save(path)
+
+
+def _print_table(rows: list[dict[str, Any]], folder: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title="the same stylisation with every renderer")
+    columns = (
+        "renderer",
+        "status",
+        "seconds_per_step",
+        "loss",
+        "distance",
+        "correlation",
+        "picture",
+    )
+    for column in columns:
+        table.add_column(column.replace("_", " "))
+    for row in rows:
+        cells = [row.get(column, "") for column in columns]
+        table.add_row(*(f"{c:.4g}" if isinstance(c, float) else str(c) for c in cells))
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=120)  # a log has no width; keep the columns' names whole
+    console.print(table)
+    console.print(f"{folder}/figure.png, {folder}/agreement.json", soft_wrap=True)
