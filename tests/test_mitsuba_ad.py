@@ -227,7 +227,7 @@ def test_missing_package_is_a_user_error(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name: None if name == "mitsuba" else find(name)
     )
-    with pytest.raises(UserError, match=r"'mitsuba'.*pip install 'styleexp\[mitsuba\]'"):
+    with pytest.raises(UserError, match=r"'mitsuba'.*pip install mitsuba"):
         llvm.prepare.__wrapped__()
 
 

@@ -200,6 +200,12 @@ def listed(installed, tmp_path_factory):
     return {(r["group"].removeprefix("styleexp."), r["name"], r["version"]): r for r in rows}
 
 
+def options(shown, kind="renderer"):
+    """The choices of a kind of part, as the help shows them."""
+    (line,) = [line for line in shown.splitlines() if line.startswith(f"{kind}: ")]
+    return line.removeprefix(f"{kind}: ").split(", ")
+
+
 def test_built_in_parts_are_listed(listed):
     from styleexp import __version__
 
@@ -370,7 +376,7 @@ def test_the_guides_file_works_without_a_package(tmp_path):
     named = {"STYLEEXP_PLUGINS": "renderer=gentle:GENTLE, field=lab:FIELD"}
     command = Path(sysconfig.get_path("scripts")) / "styleexp"  # its path lacks the folder we're in
     done = process(command, "renderer=gentle", "--help", cwd=tmp_path, **named)
-    assert "renderer: gentle, soft_raster" in done.stdout, done.stderr
+    assert "gentle" in options(done.stdout), done.stderr
     assert "field: fourier_mlp, lab_field" in done.stdout
     done = process(
         command,
@@ -446,7 +452,7 @@ def test_the_example_in_a_fresh_environment(tmp_path):
     assert where.startswith(str(venv)), where
     command = venv / "bin/styleexp"
     shown = process(command, "renderer=example_normals", "--help", cwd=tmp_path)
-    assert "renderer: example_normals, soft_raster" in shown.stdout, shown.stderr
+    assert "example_normals" in options(shown.stdout), shown.stderr
     assert "turn: 120.0" in shown.stdout
     rows = json.loads(process(venv / "bin/styleexp-plugins", "--json", cwd=tmp_path).stdout)
     (row,) = [r for r in rows if r["name"] == "example_normals"]
@@ -470,6 +476,7 @@ def test_the_example_in_a_fresh_environment(tmp_path):
 
     pip("uninstall", "--quiet", "--yes", "styleexp-plugin-example")
     shown = process(command, "--help", cwd=tmp_path)
-    assert "renderer: soft_raster" in shown.stdout
+    assert "soft_raster" in options(shown.stdout)
+    assert "example_normals" not in options(shown.stdout)
     done = process(command, "renderer=example_normals", cwd=tmp_path)
     assert "unknown renderer 'example_normals'" in done.stderr
