@@ -1,6 +1,7 @@
 # make demo   set up .venv, stylise a mesh on the CPU, say where the result is
 # make test   set up .venv, run every test
 # make lint   ruff and mypy
+# make conformance   write docs/conformance.md from the checks of every renderer
 # Override: PYTHON (which interpreter), CONSTRAINTS (pinned versions; empty for none), PIP_FLAGS.
 
 PYTHON ?= python3
@@ -15,7 +16,7 @@ export OMP_WAIT_POLICY ?= PASSIVE
 # Named meshes and images, where there are some beside the checkout.
 export STYLEEXP_ASSETS ?= $(wildcard $(abspath ../shared))
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint conformance clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -29,6 +30,9 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pip check
+
+conformance: $(VENV)/.installed-dev
+	$(BIN)/python -m styleexp.testing > docs/conformance.md
 
 clean:
 	rm -rf $(VENV) build dist src/*.egg-info

@@ -39,6 +39,8 @@ def compare(folder: Path) -> list[dict[str, Any]]:
     a share of the first's root mean square displacement; ``correlation`` that of both
     displacements; ``picture`` the mean absolute difference of four views, in [0, 1]. ``loss`` is
     the mean of the last tenth of the steps, each measured by the run's own renderer.
+    ``style_distance`` is measured by the first run's renderer and encoder for all: the loss at
+    views that were not trained on, as a share of the source's own; 1 means no style was gained.
     """
     import numpy as np
 
@@ -75,7 +77,44 @@ def compare(folder: Path) -> list[dict[str, Any]]:
         difference = np.abs(pictures[-1][1].astype(float) - pictures[0][1].astype(float))
         row["picture"] = float(difference.mean() / 255)
     _draw(pictures, folder / "figure.png")
+    settings = json.loads((folder / results[0][0]["run"] / "run.json").read_text(encoding="utf-8"))
+    distances = style_distances(settings["config"], [vertices for _, vertices, *_ in results])
+    for (row, *_), distance in zip(results, distances, strict=True):
+        row["style_distance"] = distance
     return rows
+
+
+def style_distances(
+    settings: dict[str, Any], results: list[np.ndarray]
+) -> list[float] | list[None]:
+    """Loss of each result (vertices, 3) at the style bank's views over the source's loss there.
+
+    None for all where the results were saved with more vertices than the source, split at seams.
+    """
+    import torch
+    from omegaconf import OmegaConf
+
+    from styleexp import compose, styles
+    from styleexp.scene import prepare
+
+    compose.register()
+    scene = prepare(compose.typed(OmegaConf.create(settings)))
+    if any(len(vertices) != len(scene.source.vertices) for vertices in results):
+        return [None] * len(results)
+    target, loss = scene.target(styles.BANK_STEP), scene.loss
+
+    def measure(vertices: torch.Tensor) -> float:
+        grams = styles.mesh_target(loss, scene.viewer, vertices)(0)
+        parts = [
+            float(loss.distance(*each)) for each in zip(grams, target, scene.scales, strict=True)
+        ]
+        return loss.config.lambda_global * parts[0] + loss.config.lambda_local * parts[1]
+
+    own = measure(scene.surface.vertices)
+    return [
+        measure(torch.from_numpy(scene.frame.apply(v)).to(scene.surface.vertices)) / own
+        for v in results
+    ]
 
 
 def _result(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -125,6 +164,7 @@ def _print_table(rows: list[dict[str, Any]], folder: Path) -> None:
         "status",
         "seconds_per_step",
         "loss",
+        "style_distance",
         "distance",
         "correlation",
         "picture",

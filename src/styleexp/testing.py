@@ -710,7 +710,7 @@ def _assert_supersampled(renderer: Renderer, field: Callable[[Tensor], Tensor]) 
 def conformance_table() -> str:
     """Markdown: every check for every registered renderer, with the reason of each that is no pass.
 
-    ``python -c "from styleexp import testing; print(testing.conformance_table())"``
+    ``python -m styleexp.testing`` prints the page that it is part of.
     """
     from styleexp import plugins
 
@@ -733,3 +733,14 @@ def conformance_table() -> str:
         marks = ["yes" if c[check.__name__] == "passed" else "n/a" for c in columns]
         lines.append(f"| {check.__name__.replace('_', ' ')} | " + " | ".join(marks) + " |")
     return "\n".join([*lines, "", *reasons])
+
+
+if __name__ == "__main__":
+    print("# Conformance of the renderers\n")
+    print(
+        "Made by `make conformance` from `styleexp.testing`; a test compares it. `yes`: the check"
+    )
+    print(
+        "passes; `n/a`: the backend does not claim what the check is about, for the reason below.\n"
+    )
+    print(conformance_table())
