@@ -293,3 +293,19 @@ def with_seam(mesh, path):
     lines += ["f " + " ".join(f"{v}/{t}" for v, t in face) for face in pairs.tolist()]
     path.write_text("\n".join(lines) + "\n")
     return corners, uvs, mesh.faces
+
+
+def test_a_closed_pipe_is_an_interruption_that_can_be_resumed(tmp_path):
+    arguments = ["source=torus", "style=bubble", *SMOKE, "optim.steps=20", "hydra.run.dir=run"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "styleexp", *arguments],
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    process.stdout.readline()
+    process.stdout.close()
+    assert process.wait(timeout=120) == 1
+    assert "Traceback" not in process.stderr.read()
+    status = json.loads((tmp_path / "run" / "status.json").read_text())
+    assert status["status"] == "interrupted"
+    assert command("resume=run", cwd=tmp_path).returncode == 0

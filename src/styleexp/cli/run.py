@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import time
@@ -47,6 +48,10 @@ def _guarded(
         if not resumed:
             folder.write_json("run.json", record)
         return _run(config, folder, record, resumed)
+    except BrokenPipeError:  # as with `styleexp ... | head`: the folder is not at fault
+        folder.write_status("interrupted", reason="the output was closed by its reader")
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except OSError as error:
         _fail(folder, str(error))
         raise UserError(
