@@ -99,7 +99,7 @@ def _botsch(
             other = run(length, False)
             if abs(np.log(len(other[0]) / target)) < abs(np.log(ratio)):
                 best, result = length, other
-    except Exception:
+    except Exception:  # of several kinds; the caller subdivides instead and says so
         return None
     # Kept creases suit machined shapes; on organic ones they often cost slivers or many vertices.
     with contextlib.suppress(Exception):
