@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 DIFFERENCE_GAIN = 4
 """How much darker than they are differences are drawn."""
 
+HELD_OUT_SEED = 1_000_003
+"""Added to the first run's seed for cameras that no run of the sweep was trained with."""
+
 
 class OnSweepEnd(Callback):
     """Hydra's callback: compare when all jobs are over."""
@@ -98,7 +101,9 @@ def style_distances(
     from styleexp.scene import prepare
 
     compose.register()
-    scene = prepare(compose.typed(OmegaConf.create(settings)))
+    config = compose.typed(OmegaConf.create(settings))
+    config.optim.seed += HELD_OUT_SEED  # local views of one seed all come from one bank of cameras
+    scene = prepare(config)
     if any(len(vertices) != len(scene.source.vertices) for vertices in results):
         return [None] * len(results)
     target, loss = scene.target(styles.BANK_STEP), scene.loss

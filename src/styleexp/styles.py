@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from styleexp.viewer import Viewer
 
 BANK_STEP = 1_000_000
-"""Steps from here on number the views of the style bank, so that no training view is among them."""
+"""Steps from here on number the style bank's draws, so that no training step draws the same."""
 
 
 class StyleTarget(Protocol):
