@@ -228,6 +228,9 @@ class Config:
     views: ViewsConfig = option(default_factory=ViewsConfig)
     shading: ShadingConfig = option(default_factory=ShadingConfig)
     loss: LossConfig = option(default_factory=LossConfig)
+    baseline: Any = None
+    """Another method instead of this one, to compare with; null is the method of `stylize`. Its own
+    options, with its registered ``name``; ``conf/method`` sets it."""
     optim: OptimConfig = option(default_factory=OptimConfig)
     preview: PreviewConfig = option(default_factory=PreviewConfig)
     strength: float = 1.0

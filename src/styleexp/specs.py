@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import torch
 
     from styleexp.encoders import Encoder
-    from styleexp.fields import DisplacementField
+    from styleexp.fields import DisplacementField, VertexField
     from styleexp.losses import StyleLoss
     from styleexp.meshes import Mesh
 
@@ -33,6 +33,14 @@ def _fourier_mlp(
     return DisplacementField(config, generator, sigma, bound)
 
 
+def _vertex(
+    config: FieldConfig, *, generator: torch.Generator, sigma: float, bound: float
+) -> VertexField:
+    from styleexp.fields import VertexField
+
+    return VertexField(bound)
+
+
 def _gram(config: LossConfig, *, encoder: Encoder) -> StyleLoss:
     from styleexp.losses import StyleLoss
 
@@ -46,6 +54,9 @@ STYLES = {
 FIELDS = {
     "fourier_mlp": Spec(
         "fourier_mlp", "an MLP on random Fourier features (Sec. 3.2)", FieldConfig, _fourier_mlp
+    ),
+    "vertex": Spec(
+        "vertex", "a free number for each vertex: no network (baseline)", FieldConfig, _vertex
     ),
 }
 LOSSES = {
