@@ -18,9 +18,17 @@ def mesh_relief(
 ) -> Float[np.ndarray, " vertices"]:
     """Height of each vertex over the mesh's own smoothed version, along its normal.
 
-    Smoothing is one implicit step of the graph Laplacian that flattens what is smaller than about
-    ``length``, in the units of ``vertices``. The heights' mean is zero.
+    What is smaller than about ``length`` counts: see `smoothed`. The heights' mean is zero.
     """
+    height = ((vertices - smoothed(vertices, faces, length)) * normals).sum(axis=1)
+    return height - height.mean()
+
+
+def smoothed(
+    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], length: float
+) -> Float[np.ndarray, "vertices 3"]:
+    """The vertices after one implicit step of the graph Laplacian that flattens what is smaller
+    than about ``length``, in their units."""
     from scipy.sparse import coo_matrix, diags, identity
     from scipy.sparse.linalg import splu
 
@@ -35,11 +43,7 @@ def mesh_relief(
     # On an even mesh the graph Laplacian is about 3/2 edge^2 times the true one, whose eigenvalue
     # for a wave of ``length`` is (2 pi / length)^2: such a wave is damped to a fifth.
     time = 4 * (length / (2 * np.pi * edge)) ** 2 / 1.5
-    smooth = splu((identity(count) + time * laplacian).tocsc()).solve(
-        np.ascontiguousarray(vertices)
-    )
-    height = ((vertices - smooth) * normals).sum(axis=1)
-    return height - height.mean()
+    return splu((identity(count) + time * laplacian).tocsc()).solve(np.ascontiguousarray(vertices))
 
 
 def half_range(height: Float[np.ndarray, " vertices"]) -> float:
