@@ -118,13 +118,13 @@ def prepare(config: Config) -> Scene:
     if isinstance(style, meshes.Mesh):
         _, styled = normalised(style, device)
         style_viewer = Viewer(config, renderer, shading, styled, unit)
-        if config.loss.target == "same_views":
+        if config.loss.target != "bank":
             target = styles.SameViewsTarget(loss, style_viewer, styled.vertices)
         else:
             target = styles.mesh_target(loss, style_viewer, styled.vertices)
     else:
         picture = styles.tone(torch.from_numpy(style).to(device), grey, config.style)
-        if config.loss.target == "same_views":
+        if config.loss.target != "bank":
             target = styles.FixedTarget(loss, styles.whole_image_bank(picture, config))
         else:
             target = styles.FixedTarget(loss, styles.image_bank(picture, config, unit))

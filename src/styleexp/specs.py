@@ -15,8 +15,9 @@ if TYPE_CHECKING:
     import torch
 
     from styleexp.encoders import Encoder
+    from styleexp.encoders.clip import ClipEncoder
     from styleexp.fields import DisplacementField, VertexField
-    from styleexp.losses import StyleLoss
+    from styleexp.losses import ClipLoss, StyleLoss
     from styleexp.meshes import Mesh
 
 
@@ -47,6 +48,12 @@ def _gram(config: LossConfig, *, encoder: Encoder) -> StyleLoss:
     return StyleLoss(config, encoder)
 
 
+def _clip(config: LossConfig, *, encoder: ClipEncoder) -> ClipLoss:
+    from styleexp.losses import ClipLoss
+
+    return ClipLoss(config, encoder)
+
+
 STYLES = {
     name: Spec(name, description, StyleConfig, _shape)
     for name, description in {**shapes.STYLES, **shapes.SOURCES}.items()
@@ -61,4 +68,7 @@ FIELDS = {
 }
 LOSSES = {
     "gram": Spec("gram", "squared distances of Gram matrices (Sec. 3.3)", LossConfig, _gram),
+    "clip": Spec(
+        "clip", "cosine of CLIP's embeddings, as in Text2Mesh (baseline)", LossConfig, _clip
+    ),
 }
