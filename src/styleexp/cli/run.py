@@ -16,8 +16,9 @@ from styleexp.errors import UserError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from styleexp.baselines import Method
     from styleexp.config import Config
-    from styleexp.scene import Scene
+    from styleexp.scene import Subject
     from styleexp.stylize import State, Step
 
 
@@ -76,10 +77,9 @@ def _fail(folder: records.RunFolder, reason: str) -> None:
 def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resumed: bool) -> int:
     import torch
 
-    from styleexp import sources
+    from styleexp import baselines, sources
     from styleexp.config import check
-    from styleexp.scene import prepare
-    from styleexp.stylize import optimise, start
+    from styleexp.scene import Scene
 
     if config.threads:
         torch.set_num_threads(config.threads)
@@ -89,11 +89,12 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
         from styleexp.previews import check_available
 
         check_available(config.preview.platform)
-    scene = prepare(config)
+    method = baselines.method(config)
+    scene = method.prepare(config)
     for note in scene.notes:
         print(f"note: {note}")
-    state = start(scene)
-    if resumed:
+    state = method.start(scene)
+    if resumed and state is not None:
         told = folder.load_checkpoint(state)
         if told:
             print(f"note: {told}")
@@ -101,38 +102,47 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
         folder.truncate_metrics(state.step)
     record |= {
         "device": str(scene.surface.vertices.device),
-        "encoder_precision": scene.loss.encoder.precision,
         "threads": torch.get_num_threads(),
         "chosen": {"sigma": scene.sigma, "bound": scene.bound, "relief": scene.relief},
         "assets": sources.describe(config),
         "notes": list(scene.notes),
     }
+    if isinstance(scene, Scene):
+        record["encoder_precision"] = scene.loss.encoder.precision
     folder.write_json("run.json", record)
 
-    with _interruptible() as interrupted:
-        for step in _progress(optimise(scene, state), state, config.optim.steps):
-            folder.append_metrics(step)
-            if state.step % config.optim.checkpoint_every == 0 or interrupted:
-                folder.save_checkpoint(state)
-            if interrupted and state.step < config.optim.steps:
-                folder.write_status("interrupted", step=state.step)
-                print(f"\nstopped at step {state.step}; go on with: styleexp resume={folder.path}")
-                return 130
-
-    folder.save_checkpoint(state)
-    written = _write_results(scene, state, folder)
+    if state is not None and not _optimise(method, scene, state, folder):
+        return 130
+    written = _write_results(method, scene, state, folder)
     seconds = time.perf_counter() - started
-    folder.write_status("done", step=state.step, seconds=round(seconds, 1))
+    folder.write_status("done", step=state.step if state else 0, seconds=round(seconds, 1))
     print(f"done in {seconds:.0f} s")
     _print_paths(written)
     return 0
 
 
-def _write_results(scene: Scene, state: State, folder: records.RunFolder) -> list[Path]:
-    from styleexp import previews
-    from styleexp.stylize import finish
+def _optimise(method: Method, scene: Subject, state: State, folder: records.RunFolder) -> bool:
+    """Take the remaining steps; False if the user stopped them."""
+    optim = scene.config.optim
+    with _interruptible() as interrupted:
+        for step in _progress(method.optimise(scene, state), state, optim.steps):
+            folder.append_metrics(step)
+            if state.step % optim.checkpoint_every == 0 or interrupted:
+                folder.save_checkpoint(state)
+            if interrupted and state.step < optim.steps:
+                folder.write_status("interrupted", step=state.step)
+                print(f"\nstopped at step {state.step}; go on with: styleexp resume={folder.path}")
+                return False
+    folder.save_checkpoint(state)
+    return True
 
-    result = finish(scene, state)
+
+def _write_results(
+    method: Method, scene: Subject, state: State | None, folder: records.RunFolder
+) -> list[Path]:
+    from styleexp import previews
+
+    result = method.finish(scene, state)
     for name in ("result.ply", "result.obj", "result.glb"):
         result.save(folder.path / name)
     folder.write("preview.png", lambda path: previews.write_preview(result, path))
