@@ -159,15 +159,21 @@ class RunFolder:
         return told
 
 
+def essence(config: Mapping[str, Any]) -> Any:
+    """A run's configuration as plain JSON, without what changes its speed alone."""
+    kept = {key: value for key, value in config.items() if key not in ("threads", "debug")}
+    return json.loads(json.dumps(kept, default=str))
+
+
+def first_line(error: BaseException) -> str:
+    """What an exception says, in one line."""
+    return (str(error).strip().splitlines() or [""])[0] or type(error).__name__
+
+
 def _same(before: Mapping[str, Any], now_: Mapping[str, Any]) -> bool:
-    """Whether two records are of the same run; what only speeds it up doesn't count."""
-    speed = ("threads", "debug")
-
-    def essence(record: Mapping[str, Any]) -> Any:
-        kept = {k: v for k, v in record["config"].items() if k not in speed}
-        return json.loads(json.dumps(kept, default=str)), record["versions"].get("styleexp")
-
-    return essence(before) == essence(now_)
+    """Whether two records are of the same run by the same version."""
+    versions = [each["versions"].get("styleexp") for each in (before, now_)]
+    return essence(before["config"]) == essence(now_["config"]) and versions[0] == versions[1]
 
 
 def _restore(path: Path, state: State) -> None:

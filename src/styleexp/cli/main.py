@@ -47,6 +47,7 @@ def _hydra() -> None:
     from omegaconf.errors import OmegaConfBaseException
 
     from styleexp import compose
+    from styleexp.records import first_line
     from styleexp.sweeps import report
 
     compose.register()
@@ -69,7 +70,7 @@ def _hydra() -> None:
         if report.begun is None:
             raise
         traceback.print_exc()  # a worker that was killed, or the launcher's own failure
-        print(f"styleexp: the launcher failed: {_first_line(error)}", file=sys.stderr)
+        print(f"styleexp: the launcher failed: {first_line(error)}", file=sys.stderr)
         report.finish(report.begun)
     if report.begun is not None:
         sys.exit(report.exit_code(report.begun))
@@ -113,10 +114,6 @@ def _job(config: DictConfig) -> float | None:
     return None
 
 
-def _first_line(error: BaseException) -> str:
-    return (str(error).strip().splitlines() or [""])[0] or type(error).__name__
-
-
 def _explain_plugin(error: BaseException) -> None:
     """Raise the `UserError` of a plugin that was chosen and can't be used, if that's the matter."""
     from styleexp import plugins
@@ -136,6 +133,12 @@ def explain(error: BaseException) -> str:
     if choice:
         from styleexp.errors import unknown_name
 
+        if choice[1] == "hydra/launcher":
+            extra = "ray" if choice[2] == "ray" else "sweep"
+            return (
+                f"the launcher '{choice[2]}' is not installed: pip install 'styleexp[{extra}]', or "
+                "choose launcher=basic."
+            )
         return str(unknown_name(choice[1], choice[2], _options(choice[1])))
     key = re.search(r"Key '(\w+)' (?:is )?not in", text)
     if key:

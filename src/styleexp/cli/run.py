@@ -28,20 +28,25 @@ LOCK_PATIENCE = 2.0
 
 
 def run(config: Config, folder: Path, overrides: list[str]) -> int:
-    """Stylise and write everything into ``folder``; returns the exit code.
+    """Stylise and write everything into ``folder``; returns the exit code."""
+    with _alone(folder):
+        return begin(config, folder, overrides)
+
+
+def begin(config: Config, folder: Path, overrides: list[str]) -> int:
+    """The same for a folder whose lock is held.
 
     Where the folder holds the same run, begun and not finished, it is resumed: so a job that a
     cluster requeues goes on.
     """
     record = records.describe(config, overrides, ["styleexp", *overrides])
     run_folder = records.RunFolder(folder)
-    with _alone(folder):
-        unfinished = run_folder.unfinished(record)
-        if unfinished is not None and not _same_assets(unfinished, config):
-            unfinished = None
-        if unfinished is None:
-            run_folder.clear()
-        return _guarded(config, run_folder, unfinished or record, resumed=unfinished is not None)
+    unfinished = run_folder.unfinished(record)
+    if unfinished is not None and not _same_assets(unfinished, config):
+        unfinished = None
+    if unfinished is None:
+        run_folder.clear()
+    return _guarded(config, run_folder, unfinished or record, resumed=unfinished is not None)
 
 
 def resume(folder: Path) -> int:

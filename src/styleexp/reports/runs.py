@@ -22,24 +22,37 @@ def read(folder: Path) -> dict[str, Any]:
     read is left out, and ``reason`` says so.
     """
     faults: list[str] = []
-    status = _json(folder / "status.json", faults)
+    told = _json(folder / "status.json", faults)
     record = _json(folder / "run.json", faults)
     metrics = _json(folder / "metrics.json", faults)
     row: dict[str, Any] = {
-        "status": status.get("status", "unreadable" if faults else "missing"),
-        "seconds": status.get("seconds"),
+        "status": told.get("status", "unreadable" if faults else "missing"),
+        "seconds": told.get("seconds"),
         "device": record.get("device"),
         "loss": _final_loss(folder / "metrics.jsonl"),
     }
     if row["status"] == "running" and not locks.held(folder):
         row["status"] = "died"
-    row["reason"] = "; ".join([*filter(None, [status.get("reason")]), *faults]) or None
+    row["reason"] = "; ".join([*filter(None, [told.get("reason")]), *faults]) or None
     row |= {f"metric.{name}": value for name, value in metrics.items() if _plain(value)}
     row |= {f"config.{key}": value for key, value in _flat(record.get("config") or {})}
     row |= {f"version.{name}": v for name, v in (record.get("versions") or {}).items()}
     for role, asset in (record.get("assets") or {}).items():
         row[f"asset.{role}"] = asset.get("sha256") or asset.get("name")
     return row
+
+
+def status(folder: Path) -> str | None:
+    """A run's status as it wrote it; None where it wrote none that can be read."""
+    return _json(folder / "status.json", []).get("status")
+
+
+def steps(folder: Path) -> int:
+    """How many steps a run has noted."""
+    try:
+        return (folder / "metrics.jsonl").read_bytes().count(b"\n")
+    except OSError:
+        return 0
 
 
 def _json(path: Path, faults: list[str]) -> dict[str, Any]:

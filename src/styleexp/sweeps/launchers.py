@@ -5,12 +5,40 @@ from __future__ import annotations
 import os
 from typing import Any
 
+from styleexp.errors import UserError
+
 
 def cores() -> int:
     """Cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+JOBS = {
+    "joblib": "hydra.launcher.n_jobs",
+    "submitit_local": "hydra.sweeper.max_batch_size",
+    "submitit_slurm": "hydra.launcher.array_parallelism",
+    "ray": "hydra.launcher.ray.init.num_cpus",
+}
+"""The key of each launcher that says how many jobs run at once."""
+
+
+def overrides(name: str, jobs: int | None = None) -> list[str]:
+    """The overrides that choose a launcher, and how many jobs it runs side by side."""
+    if jobs is None:
+        return [f"launcher={name}"]
+    if name not in JOBS or jobs < 1:
+        raise UserError(
+            f"--jobs {jobs} can't be done with the launcher '{name}': choose --launcher joblib and "
+            "a number from 1."
+        )
+    return [f"launcher={name}", f"{JOBS[name]}={jobs}"]
+
+
+def batch_size(hydra: Any) -> int | None:
+    """How many jobs the launcher may be given at once; None for any number."""
+    return side_by_side(hydra) if _kind(hydra) == "submitit_local" else None
 
 
 def side_by_side(hydra: Any) -> int:
