@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+import random
 import signal
 import sys
 import time
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from styleexp import records
+from styleexp import locks, records
 from styleexp.errors import UserError
 
 if TYPE_CHECKING:
@@ -22,10 +24,30 @@ if TYPE_CHECKING:
     from styleexp.stylize import State, Step
 
 
+LOCK_PATIENCE = 2.0
+"""Seconds to wait for a folder: who only looks whether it is held, holds it for a moment."""
+
+
 def run(config: Config, folder: Path, overrides: list[str]) -> int:
     """Stylise and write everything into ``folder``; returns the exit code."""
+    with _alone(folder):
+        return begin(config, folder, overrides)
+
+
+def begin(config: Config, folder: Path, overrides: list[str]) -> int:
+    """The same for a folder whose lock is held.
+
+    Where the folder holds the same run, begun and not finished, it is resumed: so a job that a
+    cluster requeues goes on.
+    """
     record = records.describe(config, overrides, ["styleexp", *overrides])
-    return _guarded(config, records.RunFolder(folder), record, resumed=False)
+    run_folder = records.RunFolder(folder)
+    unfinished = run_folder.unfinished(record)
+    if unfinished is not None and not _same_assets(unfinished, config):
+        unfinished = None
+    if unfinished is None:
+        run_folder.clear()
+    return _guarded(config, run_folder, unfinished or record, resumed=unfinished is not None)
 
 
 def resume(folder: Path) -> int:
@@ -37,7 +59,56 @@ def resume(folder: Path) -> int:
     record = records.read_record(folder)
     compose.register()
     config = compose.typed(OmegaConf.create(record["config"]))
-    return _guarded(config, records.RunFolder(folder), record, resumed=True)
+    with _alone(folder):
+        return _guarded(config, records.RunFolder(folder), record, resumed=True)
+
+
+def _same_assets(record: dict[str, Any], config: Config) -> bool:
+    """Whether source and style are the files that a run began with."""
+    from styleexp import sources
+
+    try:
+        return record.get("assets") in (None, sources.describe(config))
+    except UserError:  # the run itself will say so
+        return False
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Hold the folder's lock: two processes in one folder would mix their files."""
+    try:
+        with locks.hold(folder, LOCK_PATIENCE):
+            yield
+    except locks.Busy:
+        raise UserError(
+            f"another process is at work in '{folder}': wait for it, or choose another folder with "
+            "hydra.run.dir=FOLDER."
+        ) from None
+
+
+@cache
+def _default_threads() -> int:
+    import torch
+
+    return torch.get_num_threads()
+
+
+def _reset(config: Config) -> None:
+    """Undo what an earlier run of this process left behind: threads and global generators.
+
+    Mitsuba's variant is set in every call of its renderer.
+    """
+    import numpy as np
+    import torch
+
+    default = _default_threads()  # before it is changed
+    threads = config.threads or default
+    torch.set_num_threads(threads)
+    if "drjit" in sys.modules:
+        sys.modules["drjit"].set_thread_count(threads)
+    random.seed(config.optim.seed)
+    np.random.seed(config.optim.seed % 2**32)
+    torch.manual_seed(config.optim.seed)
 
 
 def _guarded(
@@ -81,10 +152,9 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
     from styleexp.config import check
     from styleexp.scene import Scene
 
-    if config.threads:
-        torch.set_num_threads(config.threads)
     started = time.perf_counter()
     check(config)
+    _reset(config)
     if config.preview.name == "pyrender":
         from styleexp.previews import check_available
 
