@@ -54,6 +54,13 @@ def test_without_a_baseline_the_method_is_the_papers():
     ]  # fmt: skip
 
 
+def test_a_baseline_from_python(tmp_path):
+    result = styleexp.stylize("sphere", "stripe", "method=displacement_map", "strength=0.5")
+    assert np.ptp(result.displacement) == pytest.approx(0.06 * 0.5, rel=0.2)  # the bands are 0.06
+    result.save(tmp_path / "out.ply")
+    assert len(styleexp.load_mesh(tmp_path / "out.ply").vertices) == len(result.vertices)
+
+
 PLUGIN = """
     from dataclasses import dataclass
     from styleexp.registry import Spec
@@ -406,6 +413,10 @@ def test_geometric_textures_subdivides_the_source_and_resumes_to_the_same_bits(t
     [
         (["style=rows"], "learns from a mesh, and the style 'rows' is a picture"),
         (["style=bubble", "baseline.levels=0"], "baseline.levels=0"),
+        (["style=bubble", "optim.steps=2"], "optim.steps=2 leaves a level untrained"),
+        (["style=bubble", "style.scale=9"], "the source would get 1"),
+        (["style=bubble", "style.scale=0.01"], "the source would get"),
+        (["style=bubble", "baseline.levels=6", "baseline.base=9999"], "the style would get"),
         (["style=bubble", "source=leaf"], "'leaf' can't be resampled"),
     ],
 )
