@@ -80,10 +80,10 @@ def image_bank(
     span = config.style.image_tile * unit * math.sqrt(4 * math.pi)
     for generator in _batches(config):
         yield (
-            _windows(
+            picture_windows(
                 picture, span * global_texels(views_), views_.resolution, views_.count, generator
             ),
-            _windows(
+            picture_windows(
                 picture,
                 span * local_texels(views_),
                 local.size,
@@ -157,13 +157,15 @@ def local_texels(config: ViewsConfig) -> float:
     return global_texels(config) * local.size / (side * config.resolution)
 
 
-def _windows(
+def picture_windows(
     picture: Float[Tensor, "height width"],
     longer_side: float,
     size: int,
     count: int,
     generator: torch.Generator,
 ) -> Images:
+    """``count`` square windows of ``size`` pixels at random places of a picture that is brought to
+    ``longer_side`` pixels; it is mirrored at its borders."""
     shown = resized(picture, longer_side)
     height, width = shown.shape
     cut = []

@@ -11,7 +11,7 @@ import math
 import sys
 import time
 import types
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
-    from styleexp.config import OptimConfig
+    from styleexp.config import Config, OptimConfig
 
 
 @dataclass
@@ -81,17 +81,23 @@ def stylize(source: str | Path, style: str | Path, *overrides: str) -> Result:
     nothing; ``save`` of what it returns does. Raises `UserError` for what the command line would
     report.
     """
-    chosen = [f"style={style}"] if plugins.known("style", str(style)) else []
-    config = compose([*chosen, *overrides])
-    for part, what in ((config.source, source), (config.style, style)):
-        is_file = Path(what).suffix != "" or Path(what).name != str(what)
-        setattr(part, "path" if is_file else "name", str(what))
+    config = configure(source, style, overrides)
     method = baselines.method(config)
     scene = method.prepare(config)
     state = method.start(scene)
     for _ in method.optimise(scene, state):
         pass
     return method.finish(scene, state)
+
+
+def configure(source: str | Path, style: str | Path, overrides: Sequence[str]) -> Config:
+    """The configuration of a run, from names or files and the command line's overrides."""
+    chosen = [f"style={style}"] if plugins.known("style", str(style)) else []
+    config = compose([*chosen, *overrides])
+    for part, what in ((config.source, source), (config.style, style)):
+        is_file = Path(what).suffix != "" or Path(what).name != str(what)
+        setattr(part, "path" if is_file else "name", str(what))
+    return config
 
 
 def start(scene: Scene) -> State:

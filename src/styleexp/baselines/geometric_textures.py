@@ -24,7 +24,7 @@ from styleexp.baselines.face_gan import Critic, Generator, Patch, gradient_penal
 from styleexp.baselines.pyramid import Level, pyramid, restrict, upsample
 from styleexp.errors import UserError
 from styleexp.geometry import Surface, vertex_areas
-from styleexp.relief import smoothed
+from styleexp.relief import smoother
 from styleexp.scene import Subject, load
 from styleexp.stylize import Result, State
 from styleexp.views import step_generator
@@ -341,7 +341,7 @@ def fit_exemplar(
         texture = (height - height.mean())[:, None] * finest
     else:
         vertices = frame.apply(style.vertices)
-        smooth = smoothed(vertices, style.faces, SMOOTH_LENGTH)
+        smooth = smoother(vertices, style.faces, SMOOTH_LENGTH)(vertices)
         coarse, project = _resampled(style.name, smooth, style.faces, base)
         built = pyramid(*coarse, levels, lambda points: project(points)[0], device)
         finest = built[-1].base.double().cpu().numpy()

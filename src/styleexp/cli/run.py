@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+import random
 import signal
 import sys
 import time
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from styleexp import records
+from styleexp import locks, records
 from styleexp.errors import UserError
 
 if TYPE_CHECKING:
@@ -19,13 +21,35 @@ if TYPE_CHECKING:
     from styleexp.baselines import Method
     from styleexp.config import Config
     from styleexp.scene import Subject
-    from styleexp.stylize import State, Step
+    from styleexp.stylize import Result, State, Step
+
+
+SHOWN_METRICS = ("style_distance", "silhouette_iou", "flipped_faces", "spike")
+"""What is printed of metrics.json."""
+LOCK_PATIENCE = 2.0
+"""Seconds to wait for a folder: who only looks whether it is held, holds it for a moment."""
 
 
 def run(config: Config, folder: Path, overrides: list[str]) -> int:
     """Stylise and write everything into ``folder``; returns the exit code."""
+    with _alone(folder):
+        return begin(config, folder, overrides)
+
+
+def begin(config: Config, folder: Path, overrides: list[str]) -> int:
+    """The same for a folder whose lock is held.
+
+    Where the folder holds the same run, begun and not finished, it is resumed: so a job that a
+    cluster requeues goes on.
+    """
     record = records.describe(config, overrides, ["styleexp", *overrides])
-    return _guarded(config, records.RunFolder(folder), record, resumed=False)
+    run_folder = records.RunFolder(folder)
+    unfinished = run_folder.unfinished(record)
+    if unfinished is not None and not _same_assets(unfinished, config):
+        unfinished = None
+    if unfinished is None:
+        run_folder.clear()
+    return _guarded(config, run_folder, unfinished or record, resumed=unfinished is not None)
 
 
 def resume(folder: Path) -> int:
@@ -37,7 +61,56 @@ def resume(folder: Path) -> int:
     record = records.read_record(folder)
     compose.register()
     config = compose.typed(OmegaConf.create(record["config"]))
-    return _guarded(config, records.RunFolder(folder), record, resumed=True)
+    with _alone(folder):
+        return _guarded(config, records.RunFolder(folder), record, resumed=True)
+
+
+def _same_assets(record: dict[str, Any], config: Config) -> bool:
+    """Whether source and style are the files that a run began with."""
+    from styleexp import sources
+
+    try:
+        return record.get("assets") in (None, sources.describe(config))
+    except UserError:  # the run itself will say so
+        return False
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Hold the folder's lock: two processes in one folder would mix their files."""
+    try:
+        with locks.hold(folder, LOCK_PATIENCE):
+            yield
+    except locks.Busy:
+        raise UserError(
+            f"another process is at work in '{folder}': wait for it, or choose another folder with "
+            "hydra.run.dir=FOLDER."
+        ) from None
+
+
+@cache
+def _default_threads() -> int:
+    import torch
+
+    return torch.get_num_threads()
+
+
+def _reset(config: Config) -> None:
+    """Undo what an earlier run of this process left behind: threads and global generators.
+
+    Mitsuba's variant is set in every call of its renderer.
+    """
+    import numpy as np
+    import torch
+
+    default = _default_threads()  # before it is changed
+    threads = config.threads or default
+    torch.set_num_threads(threads)
+    if "drjit" in sys.modules:
+        sys.modules["drjit"].set_thread_count(threads)
+    random.seed(config.optim.seed)
+    np.random.seed(config.optim.seed % 2**32)
+    torch.manual_seed(config.optim.seed)
 
 
 def _guarded(
@@ -77,18 +150,20 @@ def _fail(folder: records.RunFolder, reason: str) -> None:
 def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resumed: bool) -> int:
     import torch
 
-    from styleexp import baselines, sources
+    from styleexp import assets, baselines, metrics, sources
     from styleexp.config import check
     from styleexp.scene import Scene
 
-    if config.threads:
-        torch.set_num_threads(config.threads)
     started = time.perf_counter()
     check(config)
+    _reset(config)
     if config.preview.name == "pyrender":
         from styleexp.previews import check_available
 
         check_available(config.preview.platform)
+    judge = metrics.judge_name(config.metrics.judge, config.encoder.name)
+    if judge in assets.names("weights"):
+        assets.find(judge, "weights")  # if it can't be had, say so before the run, not after
     method = baselines.method(config)
     scene = method.prepare(config)
     for note in scene.notes:
@@ -106,6 +181,7 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
         "chosen": {"sigma": scene.sigma, "bound": scene.bound, "relief": scene.relief},
         "assets": sources.describe(config),
         "notes": list(scene.notes),
+        "judge": judge,
     }
     if isinstance(scene, Scene):
         record["encoder_precision"] = scene.loss.encoder.precision
@@ -149,9 +225,22 @@ def _write_results(
     folder.write("turntable.gif", lambda path: previews.write_turntable(result, path))
     names = ("preview.png", "turntable.gif", "result.glb", "result.ply", "result.obj")
     written = [folder.path / name for name in names]
+    found = _measure(result, scene.config)
+    folder.write_json("metrics.json", found)
+    print("  ".join(f"{name} {found[name]:.3g}" for name in SHOWN_METRICS if name in found))
     if scene.config.preview.name == "pyrender":
         written += previews.write_check(result, folder.write)
     return written
+
+
+def _measure(result: Result, config: Config) -> dict[str, float]:
+    """The metrics, against the result's own source: a baseline may have divided its faces."""
+    from styleexp import metrics
+
+    name = metrics.judge_name(config.metrics.judge, config.encoder.name)
+    judge = metrics.load_judge(name, config.metrics.windows)
+    source, style = result.scene.source, result.scene.style
+    return metrics.measure(config, source, style, result.vertices, source.faces, judge)
 
 
 @contextmanager

@@ -1,0 +1,5 @@
+"""From run folders to tables: ``styleexp.reports.collect(folder)``."""
+
+from styleexp.reports.collect import collect
+
+__all__ = ["collect"]
