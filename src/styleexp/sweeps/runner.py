@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 LOG = "log.txt"
 """In a job's folder: what it printed."""
 MOST_DEATHS = 3
-"""A job whose process died so often under this runner has failed."""
+"""A job whose process died so often, with no other job beside it, has failed."""
 POLL = 1.0
 """Seconds between looks at jobs that other runners are at."""
 
@@ -40,6 +40,7 @@ def run(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> None:
     `UserError` where the launcher itself fails without a job having begun.
     """
     deaths: Counter[str] = Counter()
+    suspects: set[str] = set()
     while True:
         states = {job.name: runs.read(job.folder)["status"] for job in jobs}
         for job in jobs:
@@ -52,12 +53,17 @@ def run(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> None:
                 return
             time.sleep(POLL)
             continue
-        before = _progress(folder, waiting)
-        error = _launch(waiting, folder, launcher)
-        deaths.update(j.name for j in waiting if runs.read(j.folder)["status"] == "died")
+        # A worker that dies may take the others with it: what died is tried again alone.
+        batch = [job for job in waiting if job.name not in suspects] or waiting[:1]
+        before = _progress(folder, batch)
+        error = _launch(batch, folder, launcher)
+        died = [job.name for job in batch if runs.read(job.folder)["status"] == "died"]
+        if len(batch) == 1:
+            deaths.update(died)
+        suspects.update(died)
         if error is None:
             continue
-        if _progress(folder, waiting) == before:
+        if _progress(folder, batch) == before:
             raise UserError(
                 f"the launcher failed before any job began ({records.first_line(error)}): see "
                 f"{folder} or try --launcher basic."
