@@ -1,7 +1,6 @@
 """Runs as a table: nothing is dropped, nothing is slow."""
 
 import json
-import time
 
 import pytest
 
@@ -114,20 +113,6 @@ def test_an_empty_folder_is_an_empty_table_and_none_is_a_mistake(tmp_path):
     assert "status" in collect(tmp_path).columns
     with pytest.raises(UserError, match="no folder"):
         collect(tmp_path / "none")
-
-
-def test_the_work_grows_with_the_runs_and_not_with_their_square(tmp_path):
-    """A ratio, since clocks of shared machines say little."""
-
-    def seconds(count):
-        for number in range(count):
-            make_run(tmp_path / str(count) / str(number), seconds=1.0)
-        begun = time.process_time()
-        assert len(collect(tmp_path / str(count))) == count
-        return time.process_time() - begun
-
-    seconds(20)
-    assert seconds(1000) < 40 * seconds(100)
 
 
 def test_a_search_minimises_the_style_distance_of_results_that_keep_their_outline(

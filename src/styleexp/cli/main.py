@@ -49,6 +49,7 @@ def _hydra() -> None:
     from omegaconf.errors import OmegaConfBaseException
 
     from styleexp import compose
+    from styleexp.errors import UserError
     from styleexp.records import first_line
     from styleexp.sweeps import report
 
@@ -71,9 +72,10 @@ def _hydra() -> None:
     except Exception as error:
         if report.begun is None:
             raise
-        traceback.print_exc()  # a worker that was killed, or the launcher's own failure
-        print(f"styleexp: the launcher failed: {first_line(error)}", file=sys.stderr)
+        if not isinstance(error, UserError) or DEBUG in sys.argv:
+            traceback.print_exc()
         report.finish(report.begun)
+        _stop(f"the sweep ended early: {first_line(error)}")
     if report.begun is not None:
         sys.exit(report.exit_code(report.begun))
 

@@ -29,6 +29,6 @@ def objective(folder: Path) -> float:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"a search needs style_distance and silhouette_iou in '{path}', which can't be read "
-            f"({type(error).__name__}: {error})."
+            f"({type(error).__name__})."
         ) from error
     return distance + PENALTY * max(0.0, least - iou)
