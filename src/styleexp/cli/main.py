@@ -106,8 +106,10 @@ def _job(config: DictConfig) -> float | None:
         typed.threads = typed.threads or launchers.threads_each(runtime)
         code = run(typed, Path(runtime.runtime.output_dir), list(runtime.overrides.task))
     except UserError as error:
-        if not in_sweep:
+        if config.debug or in_search:
             raise
+        if not in_sweep:
+            _stop(str(error))  # raised, Hydra would add a line of its own
         print(f"styleexp: {error}", file=sys.stderr)
     except Exception:
         if not in_sweep:

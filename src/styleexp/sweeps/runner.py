@@ -11,7 +11,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -74,13 +74,11 @@ def run(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> None:
 def retry(jobs: Sequence[Planned]) -> None:
     """Let failed jobs run again, from their checkpoints where they have one."""
     for job in jobs:
-        run_folder = records.RunFolder(job.folder)
-        try:
-            with locks.hold(job.folder):
-                if runs.status(job.folder) == "failed":
-                    run_folder.write_status("interrupted", reason="failed, to be tried again")
-        except locks.Busy:
+        if runs.status(job.folder) != "failed":
             continue
+        with suppress(locks.Busy), locks.hold(job.folder):
+            again = "failed, to be tried again"
+            records.RunFolder(job.folder).write_status("interrupted", reason=again)
 
 
 def _give_up(job: Planned, folder: Path) -> None:
