@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import torch
+from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from styleexp.errors import UserError
@@ -33,16 +34,38 @@ def gram_matrix(
     of the frame that the object fills doesn't matter. An empty mask gives zeros.
     """
     views, channels, height, width = features.shape
-    cells = features.permute(0, 2, 3, 1).reshape(views, height * width, channels)
     if mask is None:
-        count = cells.new_tensor(views * height * width, dtype=torch.float32)
+        count = torch.tensor(views * height * width, device=features.device)
     else:
-        keep = mask.reshape(views, height * width, 1)
-        cells = cells * keep.to(cells.dtype)
-        count = keep.sum().clamp(min=1)
-    # Views are summed in float32: with bfloat16 features that keeps the sum's own rounding small.
-    per_view = torch.bmm(cells.transpose(1, 2), cells).float()
-    return per_view.sum(0) / (channels * count)
+        count = mask.sum().clamp(min=1)
+    return _Gram.apply(features, mask) / (channels * count)
+
+
+class _Gram(torch.autograd.Function):
+    """The sum over views and masked cells. Its gradient F (D + D^T) is one product; autograd, which
+    doesn't know that both factors are the same, takes two and a masking."""
+
+    @staticmethod
+    def forward(ctx, features, mask):
+        views, channels, height, width = features.shape
+        cells = features.permute(0, 2, 3, 1).reshape(views, height * width, channels)
+        if mask is not None:
+            cells = cells * mask.reshape(views, height * width, 1).to(cells.dtype)
+        ctx.save_for_backward(cells)
+        ctx.cells = (height, width)
+        # Views are summed in float32 (or better): with bfloat16 features that keeps the sum's own
+        # rounding small.
+        per_view = torch.bmm(cells.transpose(1, 2), cells)
+        return per_view.to(torch.promote_types(per_view.dtype, torch.float32)).sum(0)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad):
+        (cells,) = ctx.saved_tensors
+        views, _, channels = cells.shape
+        both = (grad + grad.t()).to(cells.dtype)
+        flat = cells.reshape(-1, channels) @ both  # masked cells are zero, and so is their gradient
+        return flat.view(views, *ctx.cells, channels).permute(0, 3, 1, 2), None
 
 
 def layer_mask(
