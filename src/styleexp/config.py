@@ -174,7 +174,8 @@ class LossConfig:
     starts at about 1."""
     target: str = "bank"
     """``bank``: the style's Grams are averaged once over a bank of views. ``same_views``: the style
-    mesh is rendered at the result's views in every step, as in the paper."""
+    mesh is rendered at the result's views in every step, as in the paper. ``whole``: the same, but
+    a picture is the target of local views as a whole, too, not in crops, as in Text2Mesh."""
     bank_views: int = 24
     relief_weight: float = 0.3
     """Weight of mean((d / r)^4), where r is half the range of the style's relief: keeps the
@@ -216,6 +217,17 @@ class PreviewConfig:
 
 
 @dataclass
+class MetricsConfig:
+    """How the result is measured, in metrics.json; never seen by the optimisation."""
+
+    judge: str = "auto"
+    """The encoder that judges how near the style is: ``auto`` is one that the run doesn't train
+    with; ``none`` leaves out what needs an encoder."""
+    windows: int = 32
+    """Places of the result that are looked at."""
+
+
+@dataclass
 class Config:
     """One run."""
 
@@ -228,8 +240,12 @@ class Config:
     views: ViewsConfig = option(default_factory=ViewsConfig)
     shading: ShadingConfig = option(default_factory=ShadingConfig)
     loss: LossConfig = option(default_factory=LossConfig)
+    baseline: Any = None
+    """Another method instead of this one, to compare with; null is the method of `stylize`. Its own
+    options, with its registered ``name``; ``conf/method`` sets it."""
     optim: OptimConfig = option(default_factory=OptimConfig)
     preview: PreviewConfig = option(default_factory=PreviewConfig)
+    metrics: MetricsConfig = option(default_factory=MetricsConfig)
     strength: float = 1.0
     """Factor on the final displacement; 0 gives the source back."""
     device: str = "auto"
@@ -251,7 +267,7 @@ CHOICES = {
     "encoder.normalisation": ("weights", "paper"),
     "optim.schedule": ("step", "cosine"),
     "loss.relative": ("none", "target", "source"),
-    "loss.target": ("bank", "same_views"),
+    "loss.target": ("bank", "same_views", "whole"),
     "preview.name": ("builtin", "pyrender"),
     "preview.platform": ("auto", "egl", "osmesa"),
 }
@@ -273,6 +289,7 @@ POSITIVE = (
     "optim.decay_every",
     "optim.checkpoint_every",
     "preview.turntable_frames",
+    "metrics.windows",
 )
 
 BETWEEN = {

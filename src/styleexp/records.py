@@ -224,11 +224,13 @@ def now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def read_record(folder: Path) -> dict[str, Any]:
+def read_record(folder: Path, purpose: str = "resume") -> dict[str, Any]:
     """The ``run.json`` of a folder; a `UserError` where there is none that can be read."""
     path = folder / "run.json"
     if not path.is_file():
-        raise UserError(f"cannot resume '{folder}': it has no run.json, so it is no run's folder.")
+        raise UserError(
+            f"cannot {purpose} '{folder}': it has no run.json, so it is no run's folder."
+        )
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
         if record["schema"] != SCHEMA:

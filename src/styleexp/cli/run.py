@@ -18,11 +18,14 @@ from styleexp.errors import UserError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from styleexp.baselines import Method
     from styleexp.config import Config
-    from styleexp.scene import Scene
-    from styleexp.stylize import State, Step
+    from styleexp.scene import Subject
+    from styleexp.stylize import Result, State, Step
 
 
+SHOWN_METRICS = ("style_distance", "silhouette_iou", "flipped_faces", "spike")
+"""What is printed of metrics.json."""
 LOCK_PATIENCE = 2.0
 """Seconds to wait for a folder: who only looks whether it is held, holds it for a moment."""
 
@@ -147,10 +150,9 @@ def _fail(folder: records.RunFolder, reason: str) -> None:
 def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resumed: bool) -> int:
     import torch
 
-    from styleexp import sources
+    from styleexp import assets, baselines, metrics, sources
     from styleexp.config import check
-    from styleexp.scene import prepare
-    from styleexp.stylize import optimise, start
+    from styleexp.scene import Scene
 
     started = time.perf_counter()
     check(config)
@@ -159,11 +161,15 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
         from styleexp.previews import check_available
 
         check_available(config.preview.platform)
-    scene = prepare(config)
+    judge = metrics.judge_name(config.metrics.judge, config.encoder.name)
+    if judge in assets.names("weights"):
+        assets.find(judge, "weights")  # if it can't be had, say so before the run, not after
+    method = baselines.method(config)
+    scene = method.prepare(config)
     for note in scene.notes:
         print(f"note: {note}")
-    state = start(scene)
-    if resumed:
+    state = method.start(scene)
+    if resumed and state is not None:
         told = folder.load_checkpoint(state)
         if told:
             print(f"note: {told}")
@@ -171,47 +177,70 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
         folder.truncate_metrics(state.step)
     record |= {
         "device": str(scene.surface.vertices.device),
-        "encoder_precision": scene.loss.encoder.precision,
         "threads": torch.get_num_threads(),
         "chosen": {"sigma": scene.sigma, "bound": scene.bound, "relief": scene.relief},
         "assets": sources.describe(config),
         "notes": list(scene.notes),
+        "judge": judge,
     }
+    if isinstance(scene, Scene):
+        record["encoder_precision"] = scene.loss.encoder.precision
     folder.write_json("run.json", record)
 
-    with _interruptible() as interrupted:
-        for step in _progress(optimise(scene, state), state, config.optim.steps):
-            folder.append_metrics(step)
-            if state.step % config.optim.checkpoint_every == 0 or interrupted:
-                folder.save_checkpoint(state)
-            if interrupted and state.step < config.optim.steps:
-                folder.write_status("interrupted", step=state.step)
-                print(f"\nstopped at step {state.step}; go on with: styleexp resume={folder.path}")
-                return 130
-
-    folder.save_checkpoint(state)
-    written = _write_results(scene, state, folder)
+    if state is not None and not _optimise(method, scene, state, folder):
+        return 130
+    written = _write_results(method, scene, state, folder)
     seconds = time.perf_counter() - started
-    folder.write_status("done", step=state.step, seconds=round(seconds, 1))
+    folder.write_status("done", step=state.step if state else 0, seconds=round(seconds, 1))
     print(f"done in {seconds:.0f} s")
     _print_paths(written)
     return 0
 
 
-def _write_results(scene: Scene, state: State, folder: records.RunFolder) -> list[Path]:
-    from styleexp import previews
-    from styleexp.stylize import finish
+def _optimise(method: Method, scene: Subject, state: State, folder: records.RunFolder) -> bool:
+    """Take the remaining steps; False if the user stopped them."""
+    optim = scene.config.optim
+    with _interruptible() as interrupted:
+        for step in _progress(method.optimise(scene, state), state, optim.steps):
+            folder.append_metrics(step)
+            if state.step % optim.checkpoint_every == 0 or interrupted:
+                folder.save_checkpoint(state)
+            if interrupted and state.step < optim.steps:
+                folder.write_status("interrupted", step=state.step)
+                print(f"\nstopped at step {state.step}; go on with: styleexp resume={folder.path}")
+                return False
+    folder.save_checkpoint(state)
+    return True
 
-    result = finish(scene, state)
+
+def _write_results(
+    method: Method, scene: Subject, state: State | None, folder: records.RunFolder
+) -> list[Path]:
+    from styleexp import previews
+
+    result = method.finish(scene, state)
     for name in ("result.ply", "result.obj", "result.glb"):
         result.save(folder.path / name)
     folder.write("preview.png", lambda path: previews.write_preview(result, path))
     folder.write("turntable.gif", lambda path: previews.write_turntable(result, path))
     names = ("preview.png", "turntable.gif", "result.glb", "result.ply", "result.obj")
     written = [folder.path / name for name in names]
+    found = _measure(result, scene.config)
+    folder.write_json("metrics.json", found)
+    print("  ".join(f"{name} {found[name]:.3g}" for name in SHOWN_METRICS if name in found))
     if scene.config.preview.name == "pyrender":
         written += previews.write_check(result, folder.write)
     return written
+
+
+def _measure(result: Result, config: Config) -> dict[str, float]:
+    """The metrics, against the result's own source: a baseline may have divided its faces."""
+    from styleexp import metrics
+
+    name = metrics.judge_name(config.metrics.judge, config.encoder.name)
+    judge = metrics.load_judge(name, config.metrics.windows)
+    source, style = result.scene.source, result.scene.style
+    return metrics.measure(config, source, style, result.vertices, source.faces, judge)
 
 
 @contextmanager
