@@ -158,10 +158,28 @@ def test_grey_is_three_equal_channels():
         torch.testing.assert_close(one[name], three[name])
 
 
-def test_runs_once_and_stops_at_the_deepest_layer():
-    encoder, ran = tiny(), []
-    for name, conv in encoder.convs.items():
-        conv.register_forward_hook(lambda *_, name=name: ran.append(name))
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_fused_convolutions_are_those_apart(dtype):
+    conv = torch.nn.Conv2d(16, 32, 3, padding=1).to(dtype, memory_format=torch.channels_last)
+    conv.requires_grad_(False)
+    given = torch.randn(2, 16, 20, 18).to(dtype, memory_format=torch.channels_last)
+    weigh = torch.randn(2, 32, 20, 18).to(dtype)
+    results = []
+    for layer in (lambda x: vgg._FusedConvRelu.apply(x, conv.weight, conv.bias),
+                  lambda x: conv(x).relu()):  # fmt: skip
+        x = given.clone().requires_grad_()
+        out = layer(x)
+        (out * weigh).sum().backward()
+        results.append((out, x.grad))
+    limit = 1e-5 if dtype == torch.float32 else 0.02
+    for fused, apart in zip(*results, strict=True):
+        torch.testing.assert_close(fused, apart, rtol=limit, atol=limit)
+
+
+def test_runs_once_and_stops_at_the_deepest_layer(monkeypatch):
+    encoder, ran, real = tiny(), [], vgg._conv_relu
+    names = {conv: name for name, conv in encoder.convs.items()}
+    monkeypatch.setattr(vgg, "_conv_relu", lambda x, conv: ran.append(names[conv]) or real(x, conv))
     served = encoder(images(), ["conv3_1", "conv1_2"])
     assert list(served) == ["conv3_1", "conv1_2"]
     assert ran == ["conv1_1", "conv1_2", "conv2_1", "conv2_2", "conv3_1"]

@@ -1,7 +1,5 @@
 """``+search=optuna``: real trials."""
 
-import importlib.util
-import os
 import subprocess
 import sys
 
@@ -10,21 +8,28 @@ import pytest
 pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="needs the extra search")
 
 
-def test_a_search_runs_its_trials_and_tells_the_best(tmp_path):
-    done = subprocess.run(
+def search(cwd, *more):
+    return subprocess.run(
         [
             sys.executable, "-m", "styleexp", "+search=optuna", "source=torus", "style=bubble",
-            "profile=smoke", "encoder=vgg19_random", "hydra.sweeper.n_trials=2",
-            "hydra.sweeper.n_jobs=1", "hydra.sweep.dir=all",
+            "profile=smoke", "encoder=vgg19_random", "hydra.sweep.dir=all", *more,
         ],
-        cwd=tmp_path, env=os.environ, capture_output=True, text=True, check=False,
+        cwd=cwd, capture_output=True, text=True, check=False,
     )  # fmt: skip
-    if importlib.util.find_spec("styleexp.metrics") is None:  # nothing to minimise: it says so
-        assert done.returncode == 2
-        assert "a search needs style_distance and silhouette_iou" in done.stderr
-        assert (tmp_path / "all" / "0" / "result.ply").exists()
-        return
+
+
+def test_a_search_runs_its_trials_and_tells_the_best(tmp_path):
+    judged = ("metrics.judge=vgg19_random", "metrics.windows=2")
+    done = search(tmp_path, "hydra.sweeper.n_trials=2", *judged)
     assert done.returncode == 0, done.stderr
     assert "best_value" in (tmp_path / "all" / "optimization_results.yaml").read_text()
     assert (tmp_path / "all" / "figure.png").exists()
     assert (tmp_path / "all" / "1" / "result.ply").exists()
+
+
+def test_a_search_without_a_judge_says_what_it_lacks(tmp_path):
+    done = search(tmp_path, "hydra.sweeper.n_trials=1", "hydra.sweeper.n_jobs=1")
+    assert done.returncode == 2
+    last = done.stderr.strip().splitlines()[-1]
+    assert "a search needs style_distance and silhouette_iou" in last
+    assert "Traceback" not in done.stderr

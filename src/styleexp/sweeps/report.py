@@ -147,7 +147,7 @@ def show(rows: Sequence[dict[str, Any]], title: str) -> None:
         if row["reason"]:
             _print(f"{row['job']}: {row['status']}: {row['reason']}")
     if rows and not any("style_distance" in row for row in rows):
-        _print("style distance: not measured, no run has a metrics.json")
+        _print("style distance: not measured (metrics.judge=none, or no run is done)")
 
 
 def _number(value: Any) -> str:
