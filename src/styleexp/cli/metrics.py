@@ -71,6 +71,9 @@ def _parser() -> argparse.ArgumentParser:
 
     board = commands.add_parser("board", help="measure every run below a folder; tell styles apart")
     board.add_argument("folder", type=Path)
+    board.add_argument(
+        "--write", action="store_true", help="also write each run's metrics.json anew"
+    )
     board.set_defaults(function=_board, show=_show_board)
 
     truth = commands.add_parser("truth-board", help="test the metrics on results of known style")
@@ -124,7 +127,7 @@ def _board(options: argparse.Namespace) -> dict[str, Any]:
     judge = _judge(options)
     if judge is None:
         raise UserError("--judge none: a board's styles can't be told apart without a judge.")
-    return measure_board(options.folder, judge)
+    return measure_board(options.folder, judge, options.write)
 
 
 def _truth(options: argparse.Namespace) -> dict[str, Any]:

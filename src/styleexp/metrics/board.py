@@ -29,8 +29,10 @@ def measure_run(folder: Path, judge: Judge | None) -> dict[str, float]:
     return measure(config, source, style, vertices, faces, judge)
 
 
-def measure_board(folder: Path, judge: Judge) -> dict[str, Any]:
+def measure_board(folder: Path, judge: Judge, write: bool = False) -> dict[str, Any]:
     """Every run below ``folder``, and how well their styles can be told apart.
+
+    With ``write`` each run's ``metrics.json`` is replaced by what was measured now.
 
     ``identification`` counts the runs whose result looks nearest to their own style among all
     styles of the board, ``of`` how many were done; runs that weren't are listed as such.
@@ -51,7 +53,10 @@ def measure_board(folder: Path, judge: Judge) -> dict[str, Any]:
             continue
         name = config.style.path or str(config.style.name)
         row |= {"status": "done", "source": source.name, "style": name}
-        row |= measure(config, source, style, vertices, faces, judge)
+        found = measure(config, source, style, vertices, faces, judge)
+        if write:
+            records.RunFolder(run).write_json("metrics.json", found)
+        row |= found
         unit = unit_of(config, source, style)
         goals.setdefault(name, judge.style(config, style, unit))
         relief = relief_of_result(source, vertices, faces, unit)

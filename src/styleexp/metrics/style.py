@@ -120,25 +120,29 @@ def judged_plain(encoder: Encoder) -> Looks:
 def style_distance(result: Looks, style: Looks, plain: Looks) -> float:
     """0 for the style's own look, 1 for a surface without relief; above 1 is worse than none.
 
-    Against a mesh: squared distances of the Grams of height images, each layer's divided by that of
-    the plain surface, averaged. Against a picture: as `appearance_distance`, divided by the plain
-    surface's.
+    Distance of the correlations of features of height images, over that of the plain surface. A
+    picture has no heights: against one it is `appearance_distance`, over the plain surface's.
     """
     if style.height is None or result.height is None or plain.height is None:
         return appearance_distance(result, style) / appearance_distance(plain, style)
-    parts = [
-        (a - b).square().sum() / (p - b).square().sum().clamp(min=1e-20)
-        for a, b, p in zip(result.height, style.height, plain.height, strict=True)
-    ]
-    return float(torch.stack(parts).mean())
+    return _apart(result.height, style.height) / _apart(plain.height, style.height)
 
 
 def appearance_distance(result: Looks, style: Looks) -> float:
-    """Distance of the *correlations* of features of shaded windows: tells styles apart, meshes and
+    """Distance of the correlations of features of shaded windows: tells styles apart, meshes and
     pictures alike; not comparable from one style to another."""
+    return _apart(result.shaded, style.shaded)
+
+
+def gram_distance(result: Looks, style: Looks, plain: Looks) -> float:
+    """As `style_distance`, but of the Grams themselves, squared, as losses have it: a relief that
+    is a little too high then counts for more than one of another pattern."""
+    assert result.height is not None
+    assert style.height is not None
+    assert plain.height is not None
     parts = [
-        (_correlation(a) - _correlation(b)).norm() / len(a)
-        for a, b in zip(result.shaded, style.shaded, strict=True)
+        (a - b).square().sum() / (p - b).square().sum().clamp(min=1e-20)
+        for a, b, p in zip(result.height, style.height, plain.height, strict=True)
     ]
     return float(torch.stack(parts).mean())
 
@@ -215,6 +219,15 @@ def statistics(seen: Windows) -> Statistics:
         coherence = ((xx - yy).square() + 4 * xy.square()).sqrt()[mask].sum() / total
         rows.append([energy, skewness, upright, coherence])
     return Statistics(*(torch.stack(column) for column in zip(*rows, strict=True)))
+
+
+def _apart(result: Grams, style: Grams) -> float:
+    """Frobenius distance of the correlation matrices over their size, the mean over layers."""
+    parts = [
+        (_correlation(a) - _correlation(b)).norm() / len(a)
+        for a, b in zip(result, style, strict=True)
+    ]
+    return float(torch.stack(parts).mean())
 
 
 def _correlation(gram: Tensor) -> Tensor:

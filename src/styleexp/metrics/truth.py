@@ -26,6 +26,7 @@ from styleexp.metrics.style import (
     LAYERS,
     Looks,
     appearance_distance,
+    gram_distance,
     height_grams,
     judged,
     judged_plain,
@@ -84,10 +85,11 @@ CANDIDATES: dict[str, Metric] = {
     "style_distance": lambda r, s, p, own: style_distance(r.looks, s.looks, p.looks),
     "relief_distance": lambda r, s, p, own: relief_distance(r.looks, s.looks) or 0.0,
     "appearance_distance": lambda r, s, p, own: appearance_distance(r.looks, s.looks),
-    "random_style_distance": lambda r, s, p, own: _ratio(r.random, s.random, p.random),
+    "gram_distance": lambda r, s, p, own: gram_distance(r.looks, s.looks, p.looks),
+    "random_gram_distance": lambda r, s, p, own: _ratio(r.random, s.random, p.random),
     "view_distance": lambda r, s, p, own: _ratio(r.views, s.views, own.views),
 }
-"""Smaller is nearer. The last two are what others do; they are here to be compared with."""
+"""Smaller is nearer. The last three are not used; they are here to be compared with."""
 
 
 def wrapped(
