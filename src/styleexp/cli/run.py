@@ -120,7 +120,7 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
                 return 130
 
     folder.save_checkpoint(state)
-    written = _write_results(scene, state, folder)
+    written = _write_results(scene, state, folder, started)
     seconds = time.perf_counter() - started
     folder.write_status("done", step=state.step, seconds=round(seconds, 1))
     print(f"done in {seconds:.0f} s")
@@ -128,7 +128,9 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
     return 0
 
 
-def _write_results(scene: Scene, state: State, folder: records.RunFolder) -> list[Path]:
+def _write_results(
+    scene: Scene, state: State, folder: records.RunFolder, started: float
+) -> list[Path]:
     from styleexp import previews
     from styleexp.stylize import finish
 
@@ -141,6 +143,10 @@ def _write_results(scene: Scene, state: State, folder: records.RunFolder) -> lis
     written = [folder.path / name for name in names]
     if scene.config.preview.name == "pyrender":
         written += previews.write_check(result, folder.write)
+    if scene.config.report:  # last, as it shows what the others are about
+        from styleexp.reports import page
+
+        written.insert(0, page.write_ended(folder.path, result, time.perf_counter() - started))
     return written
 
 

@@ -1,0 +1,68 @@
+"""``styleexp-report``: pages to look at, of runs, sweeps and the user study."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from styleexp.errors import UserError
+
+DESCRIPTION = """\
+Write one self-contained HTML page about a run, or about all runs below a folder, and print its
+path. 'styleexp-report study --help' tells of the user study."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; return 0, or 2 after printing what the user can mend."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        for path in report(given):
+            print(path)
+    except UserError as error:
+        print(f"styleexp-report: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        where = f"'{error.filename}'" if error.filename else "the page"
+        print(f"styleexp-report: {where} cannot be written ({error.strerror}).", file=sys.stderr)
+        return 2
+    return 0
+
+
+def report(given: list[str]) -> list[Path]:
+    """The pages that these arguments ask for."""
+    options = _parser().parse_args(given)
+    if not options.folder.is_dir():
+        raise UserError(f"there is no folder '{options.folder}': give a run's or a sweep's.")
+    from styleexp.reports import folders, page, sweep_page
+
+    if folders.is_run(options.folder):
+        written = page.rewrite(options.folder)
+    else:
+        written = sweep_page.write(options.folder, not options.no_run_pages)
+    if options.open:
+        import webbrowser
+
+        webbrowser.open(written.resolve().as_uri())
+    return [written]
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="styleexp-report",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="of a run, a sweep, or several")
+    parser.add_argument("--open", action="store_true", help="open the page in the browser")
+    parser.add_argument(
+        "--no-run-pages",
+        action="store_true",
+        help="don't write pages for finished runs of a sweep that have none",
+    )
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())
