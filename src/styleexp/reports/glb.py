@@ -42,12 +42,13 @@ def glb(
     faces: Int[np.ndarray, "faces 3"],
     extent: float,
     values: Float[np.ndarray, " vertices"] | None = None,
-    name: str = "mesh",
+    bare: bool = False,
 ) -> bytes:
     """A binary glTF 2.0 file.
 
     ``extent`` bounds every coordinate's magnitude; meshes that are compared share it, so that equal
-    positions stay equal. ``values`` in [-1, 1] choose the colours of the heat map.
+    positions stay equal. ``values`` in [-1, 1] choose the colours of the heat map. ``bare`` leaves
+    out all but the surface.
     """
     normals = meshes.vertex_normals(vertices, faces)
     buffer = _Buffer()
@@ -58,10 +59,9 @@ def glb(
     triangles = buffer.indices(faces)
     surface = {"attributes": attributes, "indices": triangles, "material": 0}
     primitives: list[dict[str, Any]] = [surface]
-    nodes = [{"mesh": 0, "scale": [extent] * 3, "name": name}]
     materials = [_material(CLAY)]
     extra: dict[str, Any] = {}
-    if values is not None:
+    if values is not None and not bare:
         coloured = attributes | {"TEXCOORD_0": buffer.coordinates((values + 1) / 2)}
         primitives.append({"attributes": coloured, "indices": triangles, "material": 1})
         materials.append(_material((1.0, 1.0, 1.0)))
@@ -73,7 +73,7 @@ def glb(
         }
     else:
         primitives.append(surface)  # so that the edges are always node 2
-    if len(faces) <= WIREFRAME_FACES:
+    if len(faces) <= WIREFRAME_FACES and not bare:
         lines = buffer.indices(edges(faces))
         materials.append(_material(INK) | {"extensions": {"KHR_materials_unlit": {}}})
         primitives.append(
@@ -84,8 +84,7 @@ def glb(
                 "mode": 1,
             }
         )
-    for index in range(1, len(primitives)):
-        nodes.append({"mesh": index, "scale": [extent] * 3, "name": f"{name} {index}"})
+    nodes = [{"mesh": index, "scale": [extent] * 3} for index in range(len(primitives))]
     return buffer.file(
         {
             "asset": {"version": "2.0", "generator": "styleexp"},

@@ -53,21 +53,21 @@ class Shown:
             return 0.0
         return float(np.percentile(np.abs(self.displacement), WITHIN))
 
-    def files(self, wanted: tuple[str, ...] = ("source", "style", "result")) -> dict[str, bytes]:
-        """A GLB for each mesh that is wanted; source and result share their frame."""
+    def files(self, bare: bool = False) -> dict[str, bytes]:
+        """A GLB for each mesh; source and result share their frame. See `glb.glb` for ``bare``."""
         pair = [shape for shape in (self.source, self.result) if shape is not None]
         extent = max((float(np.abs(shape.vertices).max()) for shape in pair), default=1.0)
+        values = None
+        if self.displacement is not None:
+            values = np.clip(self.displacement / (self.reach or 1.0), -1, 1)
         made = {}
-        if self.source is not None and "source" in wanted:
-            made["source"] = glb.glb(self.source.vertices, self.source.faces, extent)
-        if isinstance(self.style, Shape) and "style" in wanted:
+        if self.source is not None:
+            made["source"] = glb.glb(self.source.vertices, self.source.faces, extent, bare=bare)
+        if isinstance(self.style, Shape):
             reach = float(np.abs(self.style.vertices).max())
-            made["style"] = glb.glb(self.style.vertices, self.style.faces, reach)
-        if self.result is not None and "result" in wanted:
-            values = None
-            if self.displacement is not None:
-                values = np.clip(self.displacement / (self.reach or 1.0), -1, 1)
-            made["result"] = glb.glb(self.result.vertices, self.result.faces, extent, values)
+            made["style"] = glb.glb(self.style.vertices, self.style.faces, reach, bare=bare)
+        if self.result is not None:
+            made["result"] = glb.glb(self.result.vertices, self.result.faces, extent, values, bare)
         return made
 
 

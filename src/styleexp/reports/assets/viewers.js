@@ -108,11 +108,13 @@ function linkCameras(viewers, linked) {
   return { release() { leader = null; } };
 }
 
-// Turns all viewers together until `turning()` is false.
+// Turns all viewers together until `turning()` is false or the next call.
+let turns = 0;
 function turnTogether(viewers, turning) {
+  const turn = ++turns;
   let before = null;
   function frame(now) {
-    if (!turning()) return;
+    if (turn !== turns || !turning()) return;
     const angle = before === null ? 0 : Math.min(now - before, 100) * 0.0005;
     before = now;
     for (const viewer of viewers) {
