@@ -71,7 +71,7 @@ def glb(
             "samplers": [{"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071}],
             "images": [{"bufferView": buffer.view(_colour_strip()), "mimeType": "image/png"}],
         }
-    else:
+    elif not bare:
         primitives.append(surface)  # so that the edges are always node 2
     if len(faces) <= WIREFRAME_FACES and not bare:
         lines = buffer.indices(edges(faces))

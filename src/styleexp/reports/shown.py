@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,7 +57,8 @@ class Shown:
     def files(self, bare: bool = False) -> dict[str, bytes]:
         """A GLB for each mesh; source and result share their frame. See `glb.glb` for ``bare``."""
         pair = [shape for shape in (self.source, self.result) if shape is not None]
-        extent = max((float(np.abs(shape.vertices).max()) for shape in pair), default=1.0)
+        reach = max((float(np.abs(shape.vertices).max()) for shape in pair), default=1.0)
+        extent = math.ceil(1e4 * reach) / 1e4  # the same from a file in single precision
         values = None
         if self.displacement is not None:
             values = np.clip(self.displacement / (self.reach or 1.0), -1, 1)
