@@ -2,21 +2,8 @@
 
 import json
 import os
-import re
 import subprocess
 import sys
-from pathlib import Path
-
-import pytest
-
-EXPERIMENTS = sorted((Path(__file__).parent.parent / "conf" / "experiment").glob("*.yaml"))
-
-
-@pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: path.stem)
-def test_experiment_states_its_command_and_time(path):
-    head = path.read_text().split("\n\n")[0]
-    assert f"styleexp +experiment={path.stem}" in head
-    assert re.search(r"\d+ minutes?", head)
 
 
 def sweep(folder, renderers, *flags, **environment):

@@ -11,7 +11,7 @@ import statistics
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hydra.experimental.callback import Callback
+from styleexp.sweeps import report
 
 if TYPE_CHECKING:
     import numpy as np
@@ -24,8 +24,8 @@ HELD_OUT_SEED = 1_000_003
 """Added to the first run's seed for cameras that no run of the sweep was trained with."""
 
 
-class OnSweepEnd(Callback):
-    """Hydra's callback: compare when all jobs are over."""
+class OnSweepEnd(report.OnSweep):
+    """Hydra's callback: compare when all jobs are over, instead of the usual report."""
 
     def on_multirun_end(self, config: DictConfig, **rest: Any) -> None:
         """Compare the runs in the sweep's folder; those that failed are listed as failed."""

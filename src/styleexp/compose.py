@@ -15,7 +15,7 @@ from styleexp.assets import names as asset_names
 from styleexp.shapes import SOURCES, STYLES
 
 CONFIG_PATH = "pkg://styleexp.conf"
-PARTS = ("renderer", "encoder", "style", "field", "loss")
+PARTS = ("renderer", "encoder", "style", "field", "loss", "baseline")
 """Keys of the configuration whose options are those of the part that they name."""
 
 

@@ -174,7 +174,8 @@ class LossConfig:
     starts at about 1."""
     target: str = "bank"
     """``bank``: the style's Grams are averaged once over a bank of views. ``same_views``: the style
-    mesh is rendered at the result's views in every step, as in the paper."""
+    mesh is rendered at the result's views in every step, as in the paper. ``whole``: the same, but
+    a picture is the target of local views as a whole, too, not in crops, as in Text2Mesh."""
     bank_views: int = 24
     relief_weight: float = 0.3
     """Weight of mean((d / r)^4), where r is half the range of the style's relief: keeps the
@@ -228,6 +229,9 @@ class Config:
     views: ViewsConfig = option(default_factory=ViewsConfig)
     shading: ShadingConfig = option(default_factory=ShadingConfig)
     loss: LossConfig = option(default_factory=LossConfig)
+    baseline: Any = None
+    """Another method instead of this one, to compare with; null is the method of `stylize`. Its own
+    options, with its registered ``name``; ``conf/method`` sets it."""
     optim: OptimConfig = option(default_factory=OptimConfig)
     preview: PreviewConfig = option(default_factory=PreviewConfig)
     report: bool = True
@@ -253,7 +257,7 @@ CHOICES = {
     "encoder.normalisation": ("weights", "paper"),
     "optim.schedule": ("step", "cosine"),
     "loss.relative": ("none", "target", "source"),
-    "loss.target": ("bank", "same_views"),
+    "loss.target": ("bank", "same_views", "whole"),
     "preview.name": ("builtin", "pyrender"),
     "preview.platform": ("auto", "egl", "osmesa"),
 }

@@ -84,6 +84,38 @@ class DisplacementField(nn.Module):
         return self.bound * torch.tanh(self.last(x.float()).squeeze(-1))
 
 
+class VertexField(nn.Module):
+    """A free displacement for each vertex, in (-bound, bound): what is left without the network.
+
+    Zero at the start. The number of vertices is known when ``encode`` is first called; only then
+    can an optimiser be given the parameter.
+    """
+
+    latent: nn.Parameter
+
+    def __init__(self, bound: float):
+        super().__init__()
+        self.bound = bound
+        self.latent = nn.UninitializedParameter()  # type: ignore[assignment]
+
+    def encode(
+        self, points: Float[Tensor, "vertices 3"], opened: float = 1.0
+    ) -> Float[Tensor, "vertices 3"]:
+        """The points as they are; ``opened`` means nothing here."""
+        if isinstance(self.latent, nn.UninitializedParameter):
+            self.latent.materialize((len(points),), device=points.device)
+            nn.init.zeros_(self.latent)
+        return points
+
+    def forward(
+        self, encoded: Float[Tensor, "vertices 3"], precision: torch.dtype = torch.float32
+    ) -> Float[Tensor, " vertices"]:
+        """Displacement of each vertex, in radii of the normalised source."""
+        if len(encoded) != len(self.latent):
+            raise ValueError(f"{len(self.latent)} vertices have a displacement, not {len(encoded)}")
+        return self.bound * torch.tanh(self.latent)
+
+
 def zero_mean(
     displacement: Float[Tensor, " vertices"], areas: Float[Tensor, " vertices"], bound: float
 ) -> Float[Tensor, " vertices"]:

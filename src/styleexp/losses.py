@@ -1,4 +1,4 @@
-"""Gram matrices and the style loss (Sec. 3.3.2 and 3.3.3, Eqs. 3-8)."""
+"""Gram matrices and the style loss (Sec. 3.3.2 and 3.3.3, Eqs. 3-8); Text2Mesh's, to compare."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ from typing import TYPE_CHECKING
 import torch
 from torch.nn import functional
 
+from styleexp.errors import UserError
+
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
     from torch import Tensor
 
     from styleexp.config import LossConfig
     from styleexp.encoders import Encoder
+    from styleexp.encoders.clip import ClipEncoder
     from styleexp.viewer import Images
 
 Grams = list["Float[Tensor, 'channels channels']"]
@@ -100,3 +103,32 @@ class StyleLoss:
                 scale = torch.maximum((own - goal).square().sum(), 0.02 * norm)
             divisors.append(torch.where(norm > 0, scale, torch.inf))
         return divisors
+
+
+class ClipLoss:
+    """Text2Mesh's loss (Michel et al. 2022): one minus the cosine between two mean embeddings.
+
+    Embeddings stand where `StyleLoss` has Gram matrices, so everything else of a run is the same.
+    """
+
+    def __init__(self, config: LossConfig, encoder: ClipEncoder):
+        from styleexp.encoders.clip import ClipEncoder
+
+        if not isinstance(encoder, ClipEncoder):
+            raise UserError("loss=clip compares embeddings of whole pictures: use encoder=clip.")
+        self.config = config
+        self.encoder = encoder
+
+    def grams(self, seen: Images) -> list[Float[Tensor, " size"]]:
+        """The mean embedding of the pictures, background included."""
+        return [self.encoder(seen.image.permute(0, 3, 1, 2)).mean(0)]
+
+    def distance(
+        self, grams: list[Tensor], target: list[Tensor], scales: list[Tensor]
+    ) -> Float[Tensor, ""]:
+        """From 0, the same direction, to 2."""
+        return 1 - functional.cosine_similarity(grams[0], target[0], dim=0)
+
+    def scales(self, target: list[Tensor], source: list[Tensor]) -> list[Tensor]:
+        """Nothing is divided: cosines compare as they are."""
+        return [torch.ones_like(target[0][0])]

@@ -29,6 +29,7 @@ from functools import cache, partial
 from typing import Any
 
 from styleexp import __version__, assets, specs
+from styleexp.baselines.specs import BASELINES
 from styleexp.config import EncoderConfig, FieldConfig, LossConfig, StyleConfig
 from styleexp.encoders.specs import ENCODERS
 from styleexp.errors import UserError, unknown_name
@@ -57,7 +58,7 @@ KINDS = {
     "style": Kind("styleexp.styles", specs.STYLES, StyleConfig),
     "field": Kind("styleexp.fields", specs.FIELDS, FieldConfig),
     "loss": Kind("styleexp.losses", specs.LOSSES, LossConfig),
-    "baseline": Kind("styleexp.baselines", {}),
+    "baseline": Kind("styleexp.baselines", BASELINES),
 }
 
 
@@ -282,8 +283,6 @@ def _fault(kind: str, name: str | None, spec: object) -> str | None:
         return f"has the name '{spec.name}': letters, digits, _ and - make a name"
     if name is not None and spec.name != name:
         return f"is named '{spec.name}', its entry point '{name}'"
-    if kind == "baseline":
-        return None
     config, base = spec.config, KINDS[kind].base
     if not (isinstance(config, type) and is_dataclass(config)):
         return "has a config that is no dataclass"

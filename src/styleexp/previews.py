@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
 
-from styleexp import meshes
+from styleexp import meshes, plugins
 from styleexp.check_view import UNAVAILABLE
 from styleexp.errors import UserError
 from styleexp.renderers.base import Cameras, Renderer, Shading
@@ -265,7 +265,7 @@ def write_check(result: Result, write: Callable[[str, Callable[[Path], Any]], Pa
         vertices,
         faces,
         cameras[views],
-        scene.viewer.renderer,
+        plugins.build("renderer", scene.config.renderer),
         scene.surface.vertices.device,
     )
 

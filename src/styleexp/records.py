@@ -25,6 +25,25 @@ if TYPE_CHECKING:
 SCHEMA = 1
 """Version of the run folder's layout."""
 
+FILES = (
+    "status.json",
+    "metrics.jsonl",
+    "checkpoint.safetensors",
+    "checkpoint.previous.safetensors",
+    "result.ply",
+    "result.obj",
+    "result.glb",
+    "preview.png",
+    "turntable.gif",
+    "check.png",
+    "check.gif",
+    "check.json",
+    "metrics.json",
+    "report.html",
+    "run.json",
+)
+"""What a run may leave in its folder; the record last, by which it is known as a run's."""
+
 PACKAGES = (
     "styleexp",
     "torch",
@@ -76,6 +95,22 @@ class RunFolder:
             partial.unlink(missing_ok=True)
         return target
 
+    def unfinished(self, record: Mapping[str, Any]) -> dict[str, Any] | None:
+        """The record of this folder's run if it is the same as ``record``'s and not done."""
+        try:
+            before = read_record(self.path)
+            status = json.loads((self.path / "status.json").read_text(encoding="utf-8"))
+            same = status["status"] != "done" and _same(before, record)
+        except (UserError, OSError, ValueError, KeyError, TypeError):
+            return None
+        return before if same else None
+
+    def clear(self) -> None:
+        """Remove what an earlier run left, lest it be taken for the next one's."""
+        if (self.path / "run.json").exists():
+            for name in FILES:
+                (self.path / name).unlink(missing_ok=True)
+
     def append_metrics(self, step: Step) -> None:
         """Add a step's line."""
         with open(self.metrics, "a", encoding="utf-8") as lines:
@@ -123,6 +158,23 @@ class RunFolder:
             except Exception as damage:  # safetensors raises several kinds
                 told = f"{path} is damaged ({damage}); the checkpoint before it is used."
         return told
+
+
+def essence(config: Mapping[str, Any]) -> Any:
+    """A run's configuration as plain JSON, without what changes its speed alone."""
+    kept = {key: value for key, value in config.items() if key not in ("threads", "debug")}
+    return json.loads(json.dumps(kept, default=str))
+
+
+def first_line(error: BaseException) -> str:
+    """What an exception says, in one line."""
+    return (str(error).strip().splitlines() or [""])[0] or type(error).__name__
+
+
+def _same(before: Mapping[str, Any], now_: Mapping[str, Any]) -> bool:
+    """Whether two records are of the same run by the same version."""
+    versions = [each["versions"].get("styleexp") for each in (before, now_)]
+    return essence(before["config"]) == essence(now_["config"]) and versions[0] == versions[1]
 
 
 def _restore(path: Path, state: State) -> None:
@@ -173,11 +225,13 @@ def now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def read_record(folder: Path) -> dict[str, Any]:
+def read_record(folder: Path, purpose: str = "resume") -> dict[str, Any]:
     """The ``run.json`` of a folder; a `UserError` where there is none that can be read."""
     path = folder / "run.json"
     if not path.is_file():
-        raise UserError(f"cannot resume '{folder}': it has no run.json, so it is no run's folder.")
+        raise UserError(
+            f"cannot {purpose} '{folder}': it has no run.json, so it is no run's folder."
+        )
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
         if record["schema"] != SCHEMA:

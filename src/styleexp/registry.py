@@ -19,7 +19,7 @@ class Spec:
       of shape (height, width, 3) in [0, 1].
     - field: ``factory(options, generator=, sigma=, bound=)``; ``config.FieldConfig`` or a subclass.
     - loss: ``factory(options, encoder=)``; ``config.LossConfig`` or a subclass.
-    - baseline: listed only, so far.
+    - baseline: ``factory(options)``; any dataclass. Returns a `baselines.Method`.
     """
 
     name: str

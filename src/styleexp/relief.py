@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from jaxtyping import Float, Int
 
 
@@ -18,8 +20,20 @@ def mesh_relief(
 ) -> Float[np.ndarray, " vertices"]:
     """Height of each vertex over the mesh's own smoothed version, along its normal.
 
-    Smoothing is one implicit step of the graph Laplacian that flattens what is smaller than about
-    ``length``, in the units of ``vertices``. The heights' mean is zero.
+    What is smaller than about ``length``, in the units of ``vertices``, counts as relief; see
+    ``smoother``. The heights' mean is zero.
+    """
+    smooth = smoother(vertices, faces, length)(vertices)
+    height = ((vertices - smooth) * normals).sum(axis=1)
+    return height - height.mean()
+
+
+def smoother(
+    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], length: float
+) -> Callable[[np.ndarray], np.ndarray]:
+    """A low-pass filter for what is given at the vertices, (vertices,) or (vertices, columns).
+
+    One implicit step of the graph Laplacian, which flattens what is smaller than about ``length``.
     """
     from scipy.sparse import coo_matrix, diags, identity
     from scipy.sparse.linalg import splu
@@ -35,11 +49,8 @@ def mesh_relief(
     # On an even mesh the graph Laplacian is about 3/2 edge^2 times the true one, whose eigenvalue
     # for a wave of ``length`` is (2 pi / length)^2: such a wave is damped to a fifth.
     time = 4 * (length / (2 * np.pi * edge)) ** 2 / 1.5
-    smooth = splu((identity(count) + time * laplacian).tocsc()).solve(
-        np.ascontiguousarray(vertices)
-    )
-    height = ((vertices - smooth) * normals).sum(axis=1)
-    return height - height.mean()
+    solve = splu((identity(count) + time * laplacian).tocsc()).solve
+    return lambda values: solve(np.ascontiguousarray(values, dtype=np.float64))
 
 
 def half_range(height: Float[np.ndarray, " vertices"]) -> float:

@@ -1,4 +1,8 @@
-"""All that stays fixed while the field learns: meshes, renderer, encoder, views, and the target."""
+"""All that stays fixed while the field learns: meshes, renderer, encoder, views, and the target.
+
+`Subject` is the part of it that every method needs, the baselines included; `Scene` adds what the
+style loss needs.
+"""
 
 from __future__ import annotations
 
@@ -40,9 +44,9 @@ PICTURE_DETAIL = 128
 """Pixels on a picture's longer side when its frequency is measured; finer detail doesn't count."""
 
 
-@dataclass(frozen=True)
-class Scene:
-    """What a run optimises in. Tensors are in the normalised source's frame."""
+@dataclass(frozen=True, kw_only=True)
+class Subject:
+    """What a run is about. Tensors are in the normalised source's frame."""
 
     config: Config
     source: meshes.Mesh
@@ -51,71 +55,86 @@ class Scene:
     frame: meshes.Normalisation
     surface: Surface
     areas: Float[Tensor, " vertices"]
+    unit: float
+    """How large a pattern of size 1 is on the normalised source: see `pattern_unit`."""
     sigma: float
     """Of the Fourier features, in cycles per radius of the normalised source."""
     bound: float
     """Displacements lie in (-bound, bound), in radii of the normalised source."""
     relief: float
     """Half the range of the style's own relief, in such radii."""
+    notes: tuple[str, ...] = ()
+    """What the user should know: repairs, a mesh too coarse for the style."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene(Subject):
+    """What a run optimises in: what the style loss needs, besides."""
+
     viewer: Viewer
     loss: StyleLoss
     target: StyleTarget
     scales: tuple[list[Tensor], list[Tensor]]
     """What the distances of the global and the local views are divided by, for each layer."""
-    notes: tuple[str, ...] = ()
-    """What the user should know: repairs, a mesh too coarse for the style."""
 
 
-def prepare(config: Config) -> Scene:
-    """Load source, style, renderer and encoder, and measure the style."""
+def load(config: Config) -> Subject:
+    """Load source and style, and measure the style."""
     check(config)
     device = choose_device(config.device)
     source = load_source(config.source)
     style = load_style(config.style)
     frame, surface = normalised(source, device)
-    renderer = build("renderer", config.renderer)
-    grey = foreground_mean(config, renderer, surface)
-    shading = choose_shading(config, grey)
-    encoder = build("encoder", config.encoder, device=device, seed=config.optim.seed)
-    loss = build("loss", config.loss, encoder=encoder)
-    viewer = Viewer(config, renderer, shading, surface)
-    notes = list(source.repairs)
-    target: StyleTarget
-    if isinstance(style, meshes.Mesh):
-        unit = pattern_unit(config.style, source, style)
-        _, styled = normalised(style, device)
-        style_viewer = Viewer(config, renderer, shading, styled, unit)
-        if config.loss.target == "same_views":
-            target = styles.SameViewsTarget(loss, style_viewer, styled.vertices)
-        else:
-            target = styles.mesh_target(loss, style_viewer, styled.vertices)
-    else:
-        unit = pattern_unit(config.style, source, None)
-        picture = styles.tone(torch.from_numpy(style).to(device), grey, config.style)
-        if config.loss.target == "same_views":
-            target = styles.FixedTarget(loss, styles.whole_image_bank(picture, config))
-        else:
-            target = styles.FixedTarget(loss, styles.image_bank(picture, config, unit))
-    if config.style.scale_by == "frame":
-        unit = 1.0
+    unit = pattern_unit(config.style, source, style if isinstance(style, meshes.Mesh) else None)
     sigma, bound, height = choose_field(config.field, style)
-    notes += too_coarse(source, unit / sigma)
-    goal, own = target(0), styles.mesh_target(loss, viewer, surface.vertices)(0)
-    return Scene(
+    size = 1.0 if config.style.scale_by == "frame" else unit
+    return Subject(
         config=config,
         source=source,
         style=style,
         frame=frame,
         surface=surface,
         areas=vertex_areas(surface),
-        sigma=sigma / unit,
-        bound=bound * unit,
-        relief=height * unit,
+        unit=unit,
+        sigma=sigma / size,
+        bound=bound * size,
+        relief=height * size,
+        notes=(*source.repairs, *too_coarse(source, size / sigma)),
+    )
+
+
+def prepare(config: Config) -> Scene:
+    """Load source, style, renderer and encoder, and measure the style."""
+    subject = load(config)
+    surface, style, unit = subject.surface, subject.style, subject.unit
+    device = surface.vertices.device
+    renderer = build("renderer", config.renderer)
+    grey = foreground_mean(config, renderer, surface)
+    shading = choose_shading(config, grey)
+    encoder = build("encoder", config.encoder, device=device, seed=config.optim.seed)
+    loss = build("loss", config.loss, encoder=encoder)
+    viewer = Viewer(config, renderer, shading, surface)
+    target: StyleTarget
+    if isinstance(style, meshes.Mesh):
+        _, styled = normalised(style, device)
+        style_viewer = Viewer(config, renderer, shading, styled, unit)
+        if config.loss.target != "bank":
+            target = styles.SameViewsTarget(loss, style_viewer, styled.vertices)
+        else:
+            target = styles.mesh_target(loss, style_viewer, styled.vertices)
+    else:
+        picture = styles.tone(torch.from_numpy(style).to(device), grey, config.style)
+        if config.loss.target != "bank":
+            target = styles.FixedTarget(loss, styles.whole_image_bank(picture, config))
+        else:
+            target = styles.FixedTarget(loss, styles.image_bank(picture, config, unit))
+    goal, own = target(0), styles.mesh_target(loss, viewer, surface.vertices)(0)
+    return Scene(
+        **vars(subject),
         viewer=viewer,
         loss=loss,
         target=target,
         scales=(loss.scales(goal[0], own[0]), loss.scales(goal[1], own[1])),
-        notes=tuple(notes),
     )
 
 

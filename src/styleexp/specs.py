@@ -15,8 +15,9 @@ if TYPE_CHECKING:
     import torch
 
     from styleexp.encoders import Encoder
-    from styleexp.fields import DisplacementField
-    from styleexp.losses import StyleLoss
+    from styleexp.encoders.clip import ClipEncoder
+    from styleexp.fields import DisplacementField, VertexField
+    from styleexp.losses import ClipLoss, StyleLoss
     from styleexp.meshes import Mesh
 
 
@@ -33,10 +34,24 @@ def _fourier_mlp(
     return DisplacementField(config, generator, sigma, bound)
 
 
+def _vertex(
+    config: FieldConfig, *, generator: torch.Generator, sigma: float, bound: float
+) -> VertexField:
+    from styleexp.fields import VertexField
+
+    return VertexField(bound)
+
+
 def _gram(config: LossConfig, *, encoder: Encoder) -> StyleLoss:
     from styleexp.losses import StyleLoss
 
     return StyleLoss(config, encoder)
+
+
+def _clip(config: LossConfig, *, encoder: ClipEncoder) -> ClipLoss:
+    from styleexp.losses import ClipLoss
+
+    return ClipLoss(config, encoder)
 
 
 STYLES = {
@@ -47,7 +62,13 @@ FIELDS = {
     "fourier_mlp": Spec(
         "fourier_mlp", "an MLP on random Fourier features (Sec. 3.2)", FieldConfig, _fourier_mlp
     ),
+    "vertex": Spec(
+        "vertex", "a free number for each vertex: no network (baseline)", FieldConfig, _vertex
+    ),
 }
 LOSSES = {
     "gram": Spec("gram", "squared distances of Gram matrices (Sec. 3.3)", LossConfig, _gram),
+    "clip": Spec(
+        "clip", "cosine of CLIP's embeddings, as in Text2Mesh (baseline)", LossConfig, _clip
+    ),
 }

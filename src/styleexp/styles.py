@@ -80,10 +80,10 @@ def image_bank(
     span = config.style.image_tile * unit * math.sqrt(4 * math.pi)
     for generator in _batches(config):
         yield (
-            _windows(
+            picture_windows(
                 picture, span * global_texels(views_), views_.resolution, views_.count, generator
             ),
-            _windows(
+            picture_windows(
                 picture,
                 span * local_texels(views_),
                 local.size,
@@ -96,12 +96,16 @@ def image_bank(
 def whole_image_bank(
     picture: Float[Tensor, "height width"], config: Config
 ) -> Iterator[tuple[Images, Images]]:
-    """The paper's reading: the picture itself is the global view, local views are its crops."""
+    """The paper's reading: the picture itself is the global view, local views are its crops; with
+    ``loss.target=whole`` the picture itself, too."""
     count, local = config.views.count, config.views.local
     size = [config.views.resolution, config.views.resolution]
     whole = functional.interpolate(picture[None, None], size, mode="bilinear", antialias=True)
     image = whole.permute(0, 2, 3, 1).expand(count, -1, -1, -1)
     for generator in _batches(config):
+        if config.loss.target == "whole":
+            yield _all_seen(image), _all_seen(image)
+            continue
         windows, view = views.crop_windows(local, count, generator)
         cut = views.crop_images(image, windows.to(image), view.to(image.device), local.size)
         yield _all_seen(image), _all_seen(cut)
@@ -153,13 +157,15 @@ def local_texels(config: ViewsConfig) -> float:
     return global_texels(config) * local.size / (side * config.resolution)
 
 
-def _windows(
+def picture_windows(
     picture: Float[Tensor, "height width"],
     longer_side: float,
     size: int,
     count: int,
     generator: torch.Generator,
 ) -> Images:
+    """``count`` square windows of ``size`` pixels at random places of a picture that is brought to
+    ``longer_side`` pixels; it is mirrored at its borders."""
     shown = resized(picture, longer_side)
     height, width = shown.shape
     cut = []

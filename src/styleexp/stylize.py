@@ -11,34 +11,35 @@ import math
 import sys
 import time
 import types
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
-from styleexp import meshes, plugins
+from styleexp import baselines, meshes, plugins
 from styleexp.compose import compose
 from styleexp.errors import UserError
 from styleexp.fields import zero_mean
-from styleexp.scene import Scene, prepare
+from styleexp.scene import Scene, Subject
+from styleexp.scene import prepare as prepare  # this module is a `baselines.Method`
 from styleexp.views import step_generator
 
 if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
-    from styleexp.config import OptimConfig
-    from styleexp.fields import DisplacementField
+    from styleexp.config import Config, OptimConfig
 
 
 @dataclass
 class State:
     """All that a step changes: what a checkpoint holds."""
 
-    field: DisplacementField
+    field: Any
+    """A module such as `fields.DisplacementField`."""
     optimizer: torch.optim.Adam
     step: int = 0
 
@@ -60,7 +61,8 @@ class Step:
 class Result:
     """The generated mesh M."""
 
-    scene: Scene
+    scene: Subject
+    """Its source has the result's faces."""
     displacement: Float[np.ndarray, " vertices"]
     """Signed, along the source's normals, in the source's own units."""
     vertices: Float[np.ndarray, "vertices 3"]
@@ -79,16 +81,23 @@ def stylize(source: str | Path, style: str | Path, *overrides: str) -> Result:
     nothing; ``save`` of what it returns does. Raises `UserError` for what the command line would
     report.
     """
+    config = configure(source, style, overrides)
+    method = baselines.method(config)
+    scene = method.prepare(config)
+    state = method.start(scene)
+    for _ in method.optimise(scene, state):
+        pass
+    return method.finish(scene, state)
+
+
+def configure(source: str | Path, style: str | Path, overrides: Sequence[str]) -> Config:
+    """The configuration of a run, from names or files and the command line's overrides."""
     chosen = [f"style={style}"] if plugins.known("style", str(style)) else []
     config = compose([*chosen, *overrides])
     for part, what in ((config.source, source), (config.style, style)):
         is_file = Path(what).suffix != "" or Path(what).name != str(what)
         setattr(part, "path" if is_file else "name", str(what))
-    scene = prepare(config)
-    state = start(scene)
-    for _ in optimise(scene, state):
-        pass
-    return finish(scene, state)
+    return config
 
 
 def start(scene: Scene) -> State:
@@ -99,6 +108,7 @@ def start(scene: Scene) -> State:
         "field", scene.config.field, generator=generator, sigma=scene.sigma, bound=scene.bound
     )
     displacement_field.to(scene.surface.vertices.device)
+    displacement_field.encode(scene.surface.vertices)  # lazy parameters get their shape here
     adam = torch.optim.Adam(displacement_field.parameters(), lr=optim.rate)
     return State(displacement_field, adam)
 

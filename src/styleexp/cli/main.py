@@ -6,8 +6,12 @@ import difflib
 import os
 import re
 import sys
+import traceback
 import warnings
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
 
 # Spinning OpenMP threads made a 28 ms render take 3 s on two busy cores. Read when torch loads.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -43,39 +47,16 @@ def _hydra() -> None:
     from omegaconf.errors import OmegaConfBaseException
 
     from styleexp import compose
+    from styleexp.records import first_line
+    from styleexp.sweeps import report
 
     compose.register()
-    failures: list[int] = []
 
     # Hydra prints and exits by itself unless told to raise; we want one sentence and exit code 2.
     os.environ["HYDRA_FULL_ERROR"] = "1"
-
-    @hydra.main(version_base="1.3", config_path=compose.CONFIG_PATH, config_name="config")
-    def job(config):
-        from pathlib import Path
-
-        from hydra.core.hydra_config import HydraConfig
-
-        from styleexp.cli.run import run
-        from styleexp.errors import UserError
-
-        runtime = HydraConfig.get()
-        try:
-            code = run(
-                compose.typed(config),
-                Path(runtime.runtime.output_dir),
-                list(runtime.overrides.task),
-            )
-        except UserError as error:
-            if config.debug:
-                raise
-            print(f"styleexp: {error}", file=sys.stderr)
-            code = 2
-        if code:
-            failures.append(code)
-
+    main = hydra.main(version_base="1.3", config_path=compose.CONFIG_PATH, config_name="config")
     try:
-        job()
+        main(_job)()
     except (HydraException, OmegaConfBaseException) as error:
         _explain_plugin(error)
         if DEBUG in sys.argv:
@@ -85,8 +66,52 @@ def _hydra() -> None:
         if DEBUG in sys.argv:
             raise
         _stop(f"cannot write the run's folder: {error}; choose another with hydra.run.dir=FOLDER.")
-    if failures:
-        sys.exit(max(failures))
+    except Exception as error:
+        if report.begun is None:
+            raise
+        traceback.print_exc()  # a worker that was killed, or the launcher's own failure
+        print(f"styleexp: the launcher failed: {first_line(error)}", file=sys.stderr)
+        report.finish(report.begun)
+    if report.begun is not None:
+        sys.exit(report.exit_code(report.begun))
+
+
+def _job(config: DictConfig) -> float | None:
+    """What Hydra calls for every job, maybe in another process.
+
+    A job of a sweep never raises for its own failure, so that the others go on; its folder tells.
+    """
+    from pathlib import Path
+
+    from hydra.core.hydra_config import HydraConfig
+    from omegaconf import OmegaConf
+
+    from styleexp import compose
+    from styleexp.cli.run import run
+    from styleexp.errors import UserError
+    from styleexp.sweeps import launchers
+
+    runtime = HydraConfig.get()
+    in_sweep = not OmegaConf.is_missing(runtime.job, "num")
+    compose.register()  # a launcher's process has not done so
+    code = 0
+    try:
+        typed = compose.typed(config)
+        typed.threads = typed.threads or launchers.threads_each(runtime)
+        code = run(typed, Path(runtime.runtime.output_dir), list(runtime.overrides.task))
+    except UserError as error:
+        if not in_sweep:
+            raise
+        print(f"styleexp: {error}", file=sys.stderr)
+    except Exception:
+        if not in_sweep:
+            raise
+        traceback.print_exc()
+    if code == 130 and in_sweep:
+        raise KeyboardInterrupt
+    if code and not in_sweep:
+        sys.exit(code)
+    return None
 
 
 def _explain_plugin(error: BaseException) -> None:
@@ -108,6 +133,12 @@ def explain(error: BaseException) -> str:
     if choice:
         from styleexp.errors import unknown_name
 
+        if choice[1] == "hydra/launcher":
+            extra = "ray" if choice[2] == "ray" else "sweep"
+            return (
+                f"the launcher '{choice[2]}' is not installed: pip install 'styleexp[{extra}]', or "
+                "choose launcher=basic."
+            )
         return str(unknown_name(choice[1], choice[2], _options(choice[1])))
     key = re.search(r"Key '(\w+)' (?:is )?not in", text)
     if key:

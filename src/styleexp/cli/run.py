@@ -3,28 +3,51 @@
 from __future__ import annotations
 
 import os
+import random
 import signal
 import sys
 import time
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from styleexp import records
+from styleexp import locks, records
 from styleexp.errors import UserError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from styleexp.baselines import Method
     from styleexp.config import Config
-    from styleexp.scene import Scene
-    from styleexp.stylize import State, Step
+    from styleexp.scene import Subject
+    from styleexp.stylize import Result, State, Step
+
+
+LOCK_PATIENCE = 2.0
+"""Seconds to wait for a folder: who only looks whether it is held, holds it for a moment."""
 
 
 def run(config: Config, folder: Path, overrides: list[str]) -> int:
     """Stylise and write everything into ``folder``; returns the exit code."""
+    with _alone(folder):
+        return begin(config, folder, overrides)
+
+
+def begin(config: Config, folder: Path, overrides: list[str]) -> int:
+    """The same for a folder whose lock is held.
+
+    Where the folder holds the same run, begun and not finished, it is resumed: so a job that a
+    cluster requeues goes on.
+    """
     record = records.describe(config, overrides, ["styleexp", *overrides])
-    return _guarded(config, records.RunFolder(folder), record, resumed=False)
+    run_folder = records.RunFolder(folder)
+    unfinished = run_folder.unfinished(record)
+    if unfinished is not None and not _same_assets(unfinished, config):
+        unfinished = None
+    if unfinished is None:
+        run_folder.clear()
+    return _guarded(config, run_folder, unfinished or record, resumed=unfinished is not None)
 
 
 def resume(folder: Path) -> int:
@@ -36,7 +59,56 @@ def resume(folder: Path) -> int:
     record = records.read_record(folder)
     compose.register()
     config = compose.typed(OmegaConf.create(record["config"]))
-    return _guarded(config, records.RunFolder(folder), record, resumed=True)
+    with _alone(folder):
+        return _guarded(config, records.RunFolder(folder), record, resumed=True)
+
+
+def _same_assets(record: dict[str, Any], config: Config) -> bool:
+    """Whether source and style are the files that a run began with."""
+    from styleexp import sources
+
+    try:
+        return record.get("assets") in (None, sources.describe(config))
+    except UserError:  # the run itself will say so
+        return False
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Hold the folder's lock: two processes in one folder would mix their files."""
+    try:
+        with locks.hold(folder, LOCK_PATIENCE):
+            yield
+    except locks.Busy:
+        raise UserError(
+            f"another process is at work in '{folder}': wait for it, or choose another folder with "
+            "hydra.run.dir=FOLDER."
+        ) from None
+
+
+@cache
+def _default_threads() -> int:
+    import torch
+
+    return torch.get_num_threads()
+
+
+def _reset(config: Config) -> None:
+    """Undo what an earlier run of this process left behind: threads and global generators.
+
+    Mitsuba's variant is set in every call of its renderer.
+    """
+    import numpy as np
+    import torch
+
+    default = _default_threads()  # before it is changed
+    threads = config.threads or default
+    torch.set_num_threads(threads)
+    if "drjit" in sys.modules:
+        sys.modules["drjit"].set_thread_count(threads)
+    random.seed(config.optim.seed)
+    np.random.seed(config.optim.seed % 2**32)
+    torch.manual_seed(config.optim.seed)
 
 
 def _guarded(
@@ -76,24 +148,23 @@ def _fail(folder: records.RunFolder, reason: str) -> None:
 def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resumed: bool) -> int:
     import torch
 
-    from styleexp import sources
+    from styleexp import baselines, sources
     from styleexp.config import check
-    from styleexp.scene import prepare
-    from styleexp.stylize import optimise, start
+    from styleexp.scene import Scene
 
-    if config.threads:
-        torch.set_num_threads(config.threads)
     started = time.perf_counter()
     check(config)
+    _reset(config)
     if config.preview.name == "pyrender":
         from styleexp.previews import check_available
 
         check_available(config.preview.platform)
-    scene = prepare(config)
+    method = baselines.method(config)
+    scene = method.prepare(config)
     for note in scene.notes:
         print(f"note: {note}")
-    state = start(scene)
-    if resumed:
+    state = method.start(scene)
+    if resumed and state is not None:
         told = folder.load_checkpoint(state)
         if told:
             print(f"note: {told}")
@@ -101,52 +172,57 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
         folder.truncate_metrics(state.step)
     record |= {
         "device": str(scene.surface.vertices.device),
-        "encoder_precision": scene.loss.encoder.precision,
         "threads": torch.get_num_threads(),
         "chosen": {"sigma": scene.sigma, "bound": scene.bound, "relief": scene.relief},
         "assets": sources.describe(config),
         "notes": list(scene.notes),
     }
+    if isinstance(scene, Scene):
+        record["encoder_precision"] = scene.loss.encoder.precision
     folder.write_json("run.json", record)
 
-    with _interruptible() as interrupted:
-        for step in _progress(optimise(scene, state), state, config.optim.steps):
-            folder.append_metrics(step)
-            if state.step % config.optim.checkpoint_every == 0 or interrupted:
-                folder.save_checkpoint(state)
-            if interrupted and state.step < config.optim.steps:
-                folder.write_status("interrupted", step=state.step)
-                print(f"\nstopped at step {state.step}; go on with: styleexp resume={folder.path}")
-                return 130
-
-    folder.save_checkpoint(state)
-    written = _write_results(scene, state, folder, started)
+    if state is not None and not _optimise(method, scene, state, folder):
+        return 130
+    result = method.finish(scene, state)
+    written = _write_results(result, folder)
     seconds = time.perf_counter() - started
-    folder.write_status("done", step=state.step, seconds=round(seconds, 1))
+    if config.report:  # last, as it shows what the others are about
+        from styleexp.reports import page
+
+        written.insert(0, page.write_ended(folder.path, result, seconds))
+    folder.write_status("done", step=state.step if state else 0, seconds=round(seconds, 1))
     print(f"done in {seconds:.0f} s")
     _print_paths(written)
     return 0
 
 
-def _write_results(
-    scene: Scene, state: State, folder: records.RunFolder, started: float
-) -> list[Path]:
-    from styleexp import previews
-    from styleexp.stylize import finish
+def _optimise(method: Method, scene: Subject, state: State, folder: records.RunFolder) -> bool:
+    """Take the remaining steps; False if the user stopped them."""
+    optim = scene.config.optim
+    with _interruptible() as interrupted:
+        for step in _progress(method.optimise(scene, state), state, optim.steps):
+            folder.append_metrics(step)
+            if state.step % optim.checkpoint_every == 0 or interrupted:
+                folder.save_checkpoint(state)
+            if interrupted and state.step < optim.steps:
+                folder.write_status("interrupted", step=state.step)
+                print(f"\nstopped at step {state.step}; go on with: styleexp resume={folder.path}")
+                return False
+    folder.save_checkpoint(state)
+    return True
 
-    result = finish(scene, state)
+
+def _write_results(result: Result, folder: records.RunFolder) -> list[Path]:
+    from styleexp import previews
+
     for name in ("result.ply", "result.obj", "result.glb"):
         result.save(folder.path / name)
     folder.write("preview.png", lambda path: previews.write_preview(result, path))
     folder.write("turntable.gif", lambda path: previews.write_turntable(result, path))
     names = ("preview.png", "turntable.gif", "result.glb", "result.ply", "result.obj")
     written = [folder.path / name for name in names]
-    if scene.config.preview.name == "pyrender":
+    if result.scene.config.preview.name == "pyrender":
         written += previews.write_check(result, folder.write)
-    if scene.config.report:  # last, as it shows what the others are about
-        from styleexp.reports import page
-
-        written.insert(0, page.write_ended(folder.path, result, time.perf_counter() - started))
     return written
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from styleexp.config import EncoderConfig
@@ -12,6 +13,7 @@ from styleexp.registry import Spec
 if TYPE_CHECKING:
     import torch
 
+    from styleexp.encoders.clip import ClipEncoder
     from styleexp.encoders.vgg import Encoder
 
 PRECISIONS = ("auto", "fp32", "bf16")
@@ -51,6 +53,28 @@ def _random(config: EncoderConfig, *, device: str | torch.device, seed: int) -> 
     )
 
 
+@dataclass
+class ClipConfig(EncoderConfig):
+    """CLIP, for ``loss=clip``. Always fp32; ``pooling`` and ``normalisation`` mean nothing here."""
+
+    name: str = "clip"
+    weights: str | None = None
+    """A folder with a CLIP model in transformers' format; nothing is downloaded."""
+
+
+def _clip(config: ClipConfig, *, device: str | torch.device, seed: int) -> ClipEncoder:
+    from styleexp.encoders import clip
+
+    if config.weights is None:
+        raise UserError(
+            f"encoder=clip needs weights of yours: give encoder.weights=FOLDER, {clip.WANTED} "
+            "(openai/clip-vit-base-patch32, for example)."
+        )
+    if config.precision == "bf16":
+        raise UserError("encoder=clip computes in fp32: drop encoder.precision=bf16.")
+    return clip.load(config.weights, device)
+
+
 ENCODERS: dict[str, Spec] = {
     spec.name: spec
     for spec in (
@@ -77,6 +101,14 @@ ENCODERS: dict[str, Spec] = {
             "VGG-19 with random weights, no download: smoke tests only",
             EncoderConfig,
             _random,
+        ),
+        Spec(
+            "clip",
+            "CLIP's image tower, for loss=clip (extra text2mesh, weights of your own)",
+            ClipConfig,
+            _clip,
+            ("transformers",),
+            "text2mesh",
         ),
     )
 }

@@ -30,10 +30,16 @@ from styleexp.meshes.mesh import vertex_normals as vertex_normals
 if TYPE_CHECKING:
     from styleexp.meshes.reading import load_mesh as load_mesh
     from styleexp.meshes.remeshing import remesh as remesh
+    from styleexp.meshes.remeshing import resample as resample
     from styleexp.meshes.writing import save_mesh as save_mesh
 
 # These need trimesh, which is loaded when the first of them is used.
-_HOMES = {"load_mesh": "reading", "remesh": "remeshing", "save_mesh": "writing"}
+_HOMES = {
+    "load_mesh": "reading",
+    "remesh": "remeshing",
+    "resample": "remeshing",
+    "save_mesh": "writing",
+}
 
 
 def __getattr__(name: str) -> object:

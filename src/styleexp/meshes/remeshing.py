@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import trimesh
 
+from styleexp.errors import UserError
 from styleexp.meshes.mesh import Mesh, face_areas, normalisation
 
 
@@ -44,6 +45,21 @@ def remesh(mesh: Mesh, target_vertices: int) -> Mesh:
     ):
         note += "; texture coordinates, colours and materials are not kept"
     return Mesh(mesh.name, frame.invert(vertices), faces, (*mesh.repairs, note))
+
+
+def resample(mesh: Mesh, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of an even mesh of about ``count`` vertices on the mesh's surface, whether
+    it has more or fewer. Raises `UserError` where the remesher can't take it."""
+    frame = normalisation(mesh.vertices)
+    points = frame.apply(mesh.vertices)
+    reason = unfit(points, mesh.faces)
+    result = None if reason else _botsch(points, mesh.faces, count)
+    if result is None:
+        raise UserError(
+            f"'{mesh.name}' can't be resampled to {count} vertices: "
+            f"{reason or 'the remesher failed'}; repair it, or choose another mesh."
+        )
+    return frame.invert(result[0]), result[1]
 
 
 def unfit(points: np.ndarray, faces: np.ndarray) -> str | None:

@@ -1,1 +1,5 @@
-"""What people look at after a run: pages, tables, notebooks and the user study."""
+"""From run folders to tables: ``styleexp.reports.collect(folder)``."""
+
+from styleexp.reports.collect import collect
+
+__all__ = ["collect"]

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import Any
 
+from styleexp import locks
+
 MARKS = ("run.json", "status.json", ".hydra/overrides.yaml")
 """Files that tell a run's folder; Hydra's is there before the run has a record."""
 
@@ -31,7 +33,8 @@ class Run:
 
     @property
     def state(self) -> str:
-        """``done``, ``running``, ``interrupted``, ``failed``; ``missing`` if it never began."""
+        """``done``, ``running``, ``interrupted``, ``failed``; ``missing`` if it never began,
+        ``died`` if it calls itself running and no process is at it."""
         return str(self.status.get("status", "missing"))
 
     @property
@@ -93,6 +96,8 @@ def read(folder: Path) -> Run:
         return content
 
     record, status, measured = load("run.json"), load("status.json"), load("metrics.json")
+    if status.get("status") == "running" and not locks.held(folder):
+        status["status"] = "died"
     metrics = {
         name: float(value)
         for name, value in measured.items()

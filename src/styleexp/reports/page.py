@@ -88,7 +88,9 @@ def facts(run: Run, shown: Shown) -> list[tuple[str, str]]:
     if run.steps:
         pace = statistics.median(s.get("seconds", 0.0) for s in run.steps)
         found.append(("steps", f"{run.steps[-1]['step']}, {pace:.2g} s each"))
-        found.append(("loss", f"{run.steps[0]['loss']:.3g} → {run.summary['loss']:.3g}"))
+        if "loss" in run.summary:
+            first = next(step["loss"] for step in run.steps if "loss" in step)
+            found.append(("loss", f"{first:.3g} → {run.summary['loss']:.3g}"))
     if run.record.get("device"):
         precision = run.record.get("encoder_precision")
         found.append(("device", run.record["device"] + (f", {precision}" if precision else "")))

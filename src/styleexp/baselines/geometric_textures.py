@@ -1,0 +1,348 @@
+"""Geometric textures from a GAN on triangles, after Hertz et al. 2020, compact and for a CPU.
+
+*Deep Geometric Texture Synthesis* learns from one exemplar: at each of several levels of
+subdivision a generator on faces displaces the vertices, in any direction, and a critic on faces
+tells the result from the exemplar at that level (WGAN-GP; a reconstruction from one fixed noise
+keeps the generator steady). Levels are trained one after the other, the coarsest first. Then the
+generators displace another mesh, level by level. Written from the paper's description; where this
+differs from it: docs/baselines.md.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import nn
+
+from styleexp import meshes, shapes
+from styleexp.baselines.face_gan import Critic, Generator, Patch, gradient_penalty
+from styleexp.baselines.pyramid import Level, pyramid, restrict, upsample
+from styleexp.errors import UserError
+from styleexp.geometry import vertex_areas
+from styleexp.relief import smoother
+from styleexp.scene import Subject, load, normalised
+from styleexp.stylize import Result, State
+from styleexp.views import step_generator
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from jaxtyping import Float
+    from torch import Tensor
+
+    from styleexp.baselines.specs import GeometricTexturesConfig
+    from styleexp.config import Config
+
+    Project = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
+
+NOISE = (1.0, 0.3)
+"""Added to the lowest level's input and to the others', in root mean squares of the exemplar."""
+
+PENALTY, RECONSTRUCTION = 0.1, 10.0
+"""Weights of the gradient penalty and of the reconstruction."""
+
+INNER = 0.5
+"""Share of a patch's faces, the innermost, that the critic sees: at the rim neighbours lack."""
+
+SMOOTH_LENGTH = 0.5
+"""What is larger than this, in radii of a style mesh, is its shape, not its texture."""
+
+TRAIN, RECALL, APPLY = 12, 13, 14
+"""Streams of random numbers: training, the fixed noise, and the result's."""
+
+LIMITS = {
+    "levels": (1, 6),
+    "base": (50, 50_000),
+    "iterations": (1, 10_000),
+    "critic_steps": (1, 20),
+    "patch": (100, 1_000_000),
+    "width": (4, 512),
+    "depth": (1, 16),
+}
+"""Of the options."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TextureScene(Subject):
+    """The exemplar and the source at every level. The subject's source is the finest of the
+    latter."""
+
+    exemplar: list[Level]
+    fields: list[Tensor]
+    """The exemplar's texture at each level (vertices, 3): displacements, in radii of the style."""
+    levels: list[Level]
+    """Of the source; in radii of the normalised source."""
+
+
+@dataclass(frozen=True)
+class TextureStep:
+    """Means over the iterations of one step."""
+
+    step: int
+    level: int
+    loss: float
+    """The generator's."""
+    critic: float
+    """How much higher the critic scores the exemplar than what is generated."""
+    penalty: float
+    reconstruction: float
+    """Mean square error, over the mean square of the exemplar's texture."""
+    seconds: float = field(compare=False)
+
+
+class GeometricTextures:
+    """The baseline: see the module."""
+
+    def __init__(self, config: GeometricTexturesConfig):
+        self.config = config
+        for key, (low, high) in LIMITS.items():
+            value = getattr(config, key)
+            if not low <= value <= high:
+                raise UserError(
+                    f"baseline.{key}={value} is not allowed: give a value from {low} to {high}."
+                )
+
+    def prepare(self, config: Config) -> TextureScene:
+        """Exemplar and source, subdivided."""
+        subject = load(config)
+        if not isinstance(subject.style, meshes.Mesh):
+            raise UserError(
+                "method=geometric_textures learns from a mesh, and the style "
+                f"'{config.style.path or config.style.name}' is a picture: choose a mesh as style, "
+                "or another method."
+            )
+        device = subject.surface.vertices.device
+        exemplar, fields = fit_exemplar(subject.style, self.config.base, self.config.levels, device)
+        # Triangles of the size, in the pattern, that the exemplar's have.
+        area = float(_area(subject.surface.vertices, subject.surface.faces))
+        own = float(_area(exemplar[0].base, exemplar[0].faces)) * subject.unit**2
+        count = max(20, round(len(exemplar[0].base) * area / own))
+        shape = subject.frame.apply(subject.source.vertices)
+        coarse, project = _resampled(subject.source.name, shape, subject.source.faces, count)
+        levels = pyramid(*coarse, self.config.levels, lambda points: project(points)[0], device)
+        finest = levels[-1]
+        repairs = subject.source.repairs
+        source = meshes.Mesh(
+            subject.source.name,
+            subject.frame.invert(finest.base.double().cpu().numpy()),
+            finest.faces.cpu().numpy(),
+            repairs,
+        )
+        _, surface = normalised(source, device)
+        surface = replace(surface, vertices=finest.base)
+        note = (
+            f"the result is not on the source's own faces: '{source.name}' was resampled to "
+            f"{len(levels[0].base)} vertices and subdivided to {len(finest.base)}"
+        )
+        changed = {"source": source, "surface": surface, "areas": vertex_areas(surface)}
+        changed["notes"] = (*repairs, note)
+        return TextureScene(
+            **{**vars(subject), **changed}, exemplar=exemplar, fields=fields, levels=levels
+        )
+
+    def start(self, scene: TextureScene) -> State:
+        """Untrained networks, a generator and a critic for each level."""
+        optim = scene.config.optim
+        width, depth = self.config.width, self.config.depth
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(optim.seed)
+            pairs = [(Generator(width, depth), Critic(width, depth)) for _ in scene.exemplar]
+        networks = nn.ModuleList(
+            nn.ModuleDict({"generator": generator, "critic": critic}) for generator, critic in pairs
+        )
+        networks.to(scene.surface.vertices.device)
+        # One optimiser for all: it leaves alone what has no gradient.
+        adam = torch.optim.Adam(networks.parameters(), lr=optim.rate, betas=(0.5, 0.999))
+        return State(networks, adam)
+
+    def optimise(self, scene: TextureScene, state: State) -> Iterator[TextureStep]:
+        """Train level after level, an equal share of the steps each."""
+        optim, count = scene.config.optim, len(scene.exemplar)
+        while state.step < optim.steps:
+            begun = time.perf_counter()
+            number = state.step * count // optim.steps
+            random = step_generator(optim.seed, state.step, stream=TRAIN)
+            with torch.no_grad():
+                rough = _below(scene, state.field, number, random)
+                recalled = _below(scene, state.field, number, None)
+            told = [
+                self._iterate(scene, state, number, rough, recalled, random)
+                for _ in range(self.config.iterations)
+            ]
+            state.step += 1
+            loss, critic, penalty, error = np.mean(told, axis=0).tolist()
+            if not np.isfinite([loss, critic, penalty, error]).all():
+                raise UserError(
+                    f"the training diverged at step {state.step}, level {number}: lower optim.rate."
+                )
+            seconds = time.perf_counter() - begun
+            yield TextureStep(state.step, number, loss, critic, penalty, error, seconds)
+
+    def _iterate(
+        self,
+        scene: TextureScene,
+        state: State,
+        number: int,
+        rough: Tensor,
+        recalled: Tensor,
+        random: torch.Generator,
+    ) -> tuple[float, float, float, float]:
+        """One update of a level's generator after some of its critic, on one patch."""
+        level, target = scene.exemplar[number], scene.fields[number]
+        generator, critic = state.field[number]["generator"], state.field[number]["critic"]
+        unit = target.square().sum(1).mean().sqrt()
+        patch, inner = choose_patch(level, self.config.patch, random)
+        real = inner.seen(target / unit)
+
+        def generated() -> Tensor:
+            noisy = rough / unit + _noise(rough, number, random)
+            return inner.seen(rough / unit + generator(patch, noisy))
+
+        for _ in range(self.config.critic_steps):
+            with torch.no_grad():
+                fake = generated()
+            gap = critic(real, inner.neighbours).mean() - critic(fake, inner.neighbours).mean()
+            mix = float(torch.rand(1, generator=random))
+            penalty = gradient_penalty(critic, inner, real, fake, mix)
+            self._update(state, PENALTY * penalty - gap, critic)
+
+        score = critic(generated(), inner.neighbours).mean()
+        noise = _fixed_noise(scene, rough) if number == 0 else 0.0
+        again = recalled / unit + generator(patch, recalled / unit + noise)
+        error = (inner.seen(again) - real).square().sum() / real.square().sum().clamp(min=1e-12)
+        loss = RECONSTRUCTION * error - score
+        self._update(state, loss, generator)
+        return loss.item(), gap.item(), penalty.item(), error.item()
+
+    def _update(self, state: State, loss: Tensor, network: nn.Module) -> None:
+        """Step on one network alone."""
+        parameters = list(network.parameters())
+        state.optimizer.zero_grad(set_to_none=True)
+        for parameter, grad in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
+            parameter.grad = grad
+        state.optimizer.step()
+
+    @torch.no_grad()
+    def finish(self, scene: TextureScene, state: State) -> Result:
+        """The generators, level by level, on the source."""
+        random = step_generator(scene.config.optim.seed, 0, stream=APPLY)
+        texture = torch.zeros_like(scene.levels[0].base)
+        for number, level in enumerate(scene.levels):
+            if number:
+                texture = upsample(level, texture)
+            texture = _detailed(scene, state.field, number, level, texture, random)
+        size = scene.unit * scene.config.strength * scene.frame.scale
+        moved = texture.double().cpu().numpy() * size
+        normals = scene.surface.normals.double().cpu().numpy()
+        return Result(scene, (moved * normals).sum(axis=1), scene.source.vertices + moved)
+
+
+def choose_patch(level: Level, size: int, random: torch.Generator) -> tuple[Patch, Patch]:
+    """About ``size`` faces around a random one, and the innermost of them; all if there are no
+    more."""
+    centre = int(torch.randint(len(level.faces), (1,), generator=random))
+    if len(level.faces) <= size:
+        whole = Patch.of(level)
+        return whole, whole
+    middle = level.base[level.faces].mean(1)
+    chosen = (middle - middle[centre]).square().sum(1).topk(size, largest=False).indices
+    return Patch.of(level, chosen), Patch.of(level, chosen[: round(INNER * size)])
+
+
+def _below(
+    scene: TextureScene, networks: nn.ModuleList, number: int, random: torch.Generator | None
+) -> Float[Tensor, "vertices 3"]:
+    """The exemplar's texture as the levels below ``number`` generate it, subdivided; without
+    ``random`` from the fixed noise."""
+    texture = torch.zeros_like(scene.exemplar[0].base)
+    for below in range(number):
+        texture = _detailed(scene, networks, below, scene.exemplar[below], texture, random)
+        texture = upsample(scene.exemplar[below + 1], texture)
+    return texture
+
+
+def _detailed(
+    scene: TextureScene,
+    networks: nn.ModuleList,
+    number: int,
+    level: Level,
+    texture: Float[Tensor, "vertices 3"],
+    random: torch.Generator | None,
+) -> Float[Tensor, "vertices 3"]:
+    unit = scene.fields[number].square().sum(1).mean().sqrt()
+    seen = texture / unit
+    if random is not None:
+        seen = seen + _noise(texture, number, random)
+    elif number == 0:
+        seen = seen + _fixed_noise(scene, texture)
+    generator: nn.Module = networks[number]["generator"]  # type: ignore[index]
+    return texture + unit * generator(Patch.of(level), seen)
+
+
+def _noise(like: Tensor, number: int, random: torch.Generator) -> Tensor:
+    return NOISE[min(number, 1)] * torch.randn(like.shape, generator=random).to(like)
+
+
+def _fixed_noise(scene: TextureScene, like: Tensor) -> Tensor:
+    return _noise(like, 0, step_generator(scene.config.optim.seed, 0, stream=RECALL))
+
+
+def fit_exemplar(
+    style: meshes.Mesh, base: int, levels: int, device: torch.device
+) -> tuple[list[Level], list[Float[Tensor, "vertices 3"]]]:
+    """The style with subdivision connectivity, and its texture at each level, in its own radii.
+
+    An analytic style is its relief on a sphere. Of any other mesh the smoothed surface is resampled
+    and subdivided, and its texture is where the mesh itself lies: no optimisation is needed.
+    """
+    frame = meshes.normalisation(style.vertices)
+    if style.carrier is None and style.name in shapes.STYLES:
+        radius = 1 / frame.scale
+        points, faces = shapes.icosphere(base)
+
+        def onto(points: np.ndarray) -> np.ndarray:
+            return radius * points / np.linalg.norm(points, axis=1, keepdims=True)
+
+        built = pyramid(onto(points), faces, levels, onto, device)
+        finest = built[-1].base.double().cpu().numpy()
+        height = shapes.relief(style.name, finest)
+        texture = (height - height.mean())[:, None] * finest
+    else:
+        vertices = frame.apply(style.vertices)
+        smooth = smoother(vertices, style.faces, SMOOTH_LENGTH)(vertices)
+        coarse, project = _resampled(style.name, smooth, style.faces, base)
+        built = pyramid(*coarse, levels, lambda points: project(points)[0], device)
+        finest = built[-1].base.double().cpu().numpy()
+        _, face, weights = project(finest)
+        texture = np.einsum("vk,vkx->vx", weights, (vertices - smooth)[style.faces[face]])
+    fields = [torch.from_numpy(texture).float().to(device)]
+    for level in reversed(built[1:]):
+        fields.insert(0, restrict(level, fields[0]))
+    return built, fields
+
+
+def _resampled(
+    name: str, vertices: np.ndarray, faces: np.ndarray, count: int
+) -> tuple[tuple[np.ndarray, np.ndarray], Project]:
+    """About ``count`` even vertices on a surface, and the projection of points onto it: the points,
+    their faces, and their barycentric weights there."""
+    import gpytoolbox
+
+    triangles = faces.astype(np.int32)
+
+    def project(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        _, face, weights = gpytoolbox.squared_distance(points, vertices, F=triangles, use_cpp=True)
+        nearest = np.einsum("vk,vkx->vx", weights, vertices[faces[face]])
+        return nearest, face, weights
+
+    return meshes.resample(meshes.Mesh(name, vertices, faces), count), project
+
+
+def _area(vertices: Tensor, faces: Tensor) -> Tensor:
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return torch.linalg.cross(b - a, c - a).norm(dim=1).sum() / 2

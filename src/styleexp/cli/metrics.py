@@ -1,0 +1,197 @@
+"""``styleexp-metrics``: measure results, and test the metrics themselves."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from styleexp.errors import UserError
+
+if TYPE_CHECKING:
+    from styleexp.metrics import Judge
+
+# Read when torch loads; see cli.main.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+TRUTH_SOURCES = ("sphere", "torus", "critter")
+"""Sources of the truth board that need no files."""
+COLUMNS = ("rank1", "scale", "noise", "strength", "no_style")
+SHOWN = (
+    "source",
+    "style",
+    "style_distance",
+    "relief_distance",
+    "looks_like",
+    "silhouette_iou",
+    "flipped_faces",
+    "self_intersections",
+    "spike",
+    "status",
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; return 0, or 2 after printing what the user can mend."""
+    options = _parser().parse_args(arguments)
+    try:
+        found = options.function(options)
+    except UserError as error:
+        print(f"styleexp-metrics: {error}", file=sys.stderr)
+        return 2
+    if options.json:
+        print(json.dumps(found, indent=2))
+    else:
+        options.show(found)
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="styleexp-metrics",
+        description="Measure results: how near to the style, how much of the shape was kept. "
+        "docs/metrics.md says what each number means and how far it can be trusted.",
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    run = commands.add_parser("run", help="measure a finished run's result anew")
+    run.add_argument("folder", type=Path)
+    run.set_defaults(function=_run, show=_show_one)
+
+    compare = commands.add_parser("compare", help="measure any result, whatever made it")
+    compare.add_argument("result", type=Path, help="mesh file, in the source's frame")
+    compare.add_argument("source", help="mesh file or name")
+    compare.add_argument("style", help="mesh or image file, or name")
+    compare.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="such as style.scale=2")
+    compare.set_defaults(function=_compare, show=_show_one)
+
+    board = commands.add_parser("board", help="measure every run below a folder; tell styles apart")
+    board.add_argument("folder", type=Path)
+    board.set_defaults(function=_board, show=_show_board)
+
+    truth = commands.add_parser("truth-board", help="test the metrics on results of known style")
+    truth.add_argument("--sources", default=",".join(TRUTH_SOURCES), help="names, comma-separated")
+    truth.add_argument("--vertices", type=int, default=30_000, help="of each source, about")
+    truth.set_defaults(function=_truth, show=_show_truth)
+
+    for command in (run, compare, board, truth):
+        command.add_argument("--json", action="store_true", help="everything, as JSON")
+        command.add_argument("--judge", default="auto", metavar="ENCODER", help=JUDGE_HELP)
+        command.add_argument("--windows", type=int, default=32, help="places looked at (32)")
+    return parser
+
+
+JUDGE_HELP = "encoder that judges, none for metrics without one (an encoder the run did not train)"
+
+
+def _judge(options: argparse.Namespace, trained: str | None = None) -> Judge | None:
+    from styleexp.metrics import choose_judge
+
+    if options.windows < 1:
+        raise UserError(f"--windows {options.windows}: give 1 or more.")
+    return choose_judge(options.judge, trained, options.windows)
+
+
+def _run(options: argparse.Namespace) -> dict[str, Any]:
+    from styleexp import records
+    from styleexp.metrics.board import measure_run
+
+    trained = records.read_record(options.folder, "measure")["config"]["encoder"]["name"]
+    return measure_run(options.folder, _judge(options, trained))
+
+
+def _compare(options: argparse.Namespace) -> dict[str, Any]:
+    from styleexp.metrics import measure
+    from styleexp.metrics.board import read_result
+    from styleexp.sources import load_source, load_style
+    from styleexp.stylize import configure
+
+    if not options.result.is_file():
+        raise UserError(f"there is no file '{options.result}': give the result's mesh file.")
+    config = configure(options.source, options.style, options.overrides)
+    source, style = load_source(config.source), load_style(config.style)
+    vertices, faces = read_result(options.result, source)
+    return measure(config, source, style, vertices, faces, _judge(options))
+
+
+def _board(options: argparse.Namespace) -> dict[str, Any]:
+    from styleexp.metrics.board import measure_board
+
+    judge = _judge(options)
+    if judge is None:
+        raise UserError("--judge none: a board's styles can't be told apart without a judge.")
+    return measure_board(options.folder, judge)
+
+
+def _truth(options: argparse.Namespace) -> dict[str, Any]:
+    from styleexp import meshes, shapes
+    from styleexp.config import SourceConfig
+    from styleexp.metrics.truth import judge_metrics, measure_board
+    from styleexp.sources import load_source
+
+    names = options.sources.split(",")
+    sources = []
+    for name in names:
+        if name in shapes.SOURCES:
+            sources.append(shapes.make(name, options.vertices))
+        else:
+            sources.append(meshes.remesh(load_source(SourceConfig(name=name)), options.vertices))
+    judge = _judge(options)
+    if judge is None:
+        raise UserError("--judge none: the truth board tests what a judge sees; name an encoder.")
+    board = measure_board(
+        sources, judge.name, options.windows, lambda told: print(told, file=sys.stderr, flush=True)
+    )
+    found = judge_metrics(board)
+    return {
+        "rank1": {name: verdict["rank1"] for name, verdict in found.items()},
+        "cases": len(names) * len(shapes.STYLES),
+        "sources": names,
+        "judge": judge.name,
+        "metrics": found,
+    }
+
+
+def _show_one(found: dict[str, Any]) -> None:
+    for name, value in found.items():
+        print(f"{name:20s} {value:.4g}")
+
+
+def _show_board(found: dict[str, Any]) -> None:
+    _table(
+        [*SHOWN],
+        [[row.get(c, "") for c in SHOWN] for row in found["runs"]],
+    )
+    print(
+        f"told apart: {found['identification']} of {found['of']} among {found['styles']} styles; "
+        f"silhouette IoU at least {found['min_silhouette_iou']:.3f}; flipped faces at most "
+        f"{100 * found['max_flipped']:.2f} %"
+    )
+
+
+def _show_truth(found: dict[str, Any]) -> None:
+    rows = [
+        [name, *(f"{verdict[c]:.3f}" for c in COLUMNS), "yes" if verdict["kept"] else "no"]
+        for name, verdict in found["metrics"].items()
+    ]
+    _table(["metric", *COLUMNS, "kept"], rows)
+    print(f"shares of {found['cases']} cases, judged by {found['judge']}")
+
+
+def _table(columns: list[str], rows: list[list[Any]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table()
+    for column in columns:
+        table.add_column(column.replace("_", " "))
+    for row in rows:
+        table.add_row(*(f"{c:.3g}" if isinstance(c, float) else str(c) for c in row))
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=160)  # a log has no width
+    console.print(table)

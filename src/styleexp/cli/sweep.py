@@ -1,0 +1,185 @@
+"""``styleexp-sweep``: run a plan of experiments, show where it is, collect what came out."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as in cli/main.py
+
+from styleexp.errors import UserError
+
+if TYPE_CHECKING:
+    from styleexp.sweeps.plan import Plan, Planned
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; 0 if all jobs are done, 2 if not or for what the user can mend."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    commands = {"status": _status, "collect": _collect}
+    try:
+        if given and given[0] in commands:
+            parser = argparse.ArgumentParser(prog=f"styleexp-sweep {given[0]}")
+            parser.add_argument("folder", type=Path)
+            folder = parser.parse_args(given[1:]).folder
+            if not folder.is_dir():
+                raise UserError(f"there is no folder '{folder}'.")
+            return commands[given[0]](folder)
+        return _run(_parser().parse_args(given))
+    except UserError as error:
+        print(f"styleexp-sweep: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("stopped; the same command goes on from here.", file=sys.stderr)
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="styleexp-sweep",
+        description="Run a plan of experiments, or go on with it: done jobs are skipped, those "
+        "that died are resumed. Any number of runners may share a folder.",
+        epilog="styleexp-sweep status FOLDER shows every job; styleexp-sweep collect FOLDER writes "
+        "runs.csv and runs.parquet.",
+    )
+    parser.add_argument("plan", type=Path, metavar="PLAN", help="a file of sweeps/")
+    parser.add_argument(
+        "overrides", nargs="*", metavar="KEY=VALUE", help="of every job: profile=standard; those "
+        "that begin with hydra. are the launcher's: hydra.launcher.partition=gpu",
+    )  # fmt: skip
+    parser.add_argument("--folder", type=Path, help="default: outputs/ and the plan's name")
+    parser.add_argument("--launcher", metavar="NAME", help="basic, joblib, submitit_local, "
+                        "submitit_slurm or ray; default: the plan's")  # fmt: skip
+    parser.add_argument("--jobs", type=int, metavar="N", help="run N jobs side by side")
+    parser.add_argument("--retry", action="store_true", help="run failed jobs again")
+    parser.add_argument("--dry-run", action="store_true", help="print the commands, run nothing")
+    return parser
+
+
+def _run(options: argparse.Namespace) -> int:
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    from styleexp.cli.main import explain
+    from styleexp.sweeps import launchers, manifest, plan, runner
+
+    read = plan.read(options.plan)
+    folder = options.folder or Path("outputs") / options.plan.stem
+    own = [each for each in options.overrides if each.startswith("hydra.")]
+    launcher = launchers.overrides(options.launcher or read.launcher, options.jobs) + own
+    chosen = [each for each in options.overrides if not each.startswith("hydra.")]
+    try:
+        by_entry = plan.jobs(read, folder, chosen)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(f"{options.plan}: {explain(error)}") from error
+    jobs = list({job.name: job for listed in by_entry.values() for job in listed}.values())
+    if options.dry_run:
+        _show_commands(read, by_entry, chosen)
+        return 0
+    try:
+        manifest.write(folder, jobs)
+        if options.retry:
+            runner.retry(jobs)
+        print(f"{len(jobs)} jobs, {folder}", flush=True)
+        runner.run(jobs, folder, launcher)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(explain(error)) from error
+    except OSError as error:
+        raise UserError(f"writing to '{folder}' failed: {error}.") from error
+    return _report(read, by_entry, folder)
+
+
+def _report(read: Plan, by_entry: dict[str, list[Planned]], folder: Path) -> int:
+    """Tables and figures of every experiment; the exit code."""
+    from styleexp.reports import runs
+    from styleexp.sweeps.report import report
+
+    for entry in read.experiments:
+        assert entry.name is not None
+        title = f"{entry.name} ({entry.figure})" if entry.figure else entry.name
+        (folder / entry.name).mkdir(exist_ok=True)
+        report(by_entry[entry.name], folder / entry.name, title)
+    states = [runs.read(job.folder)["status"] for jobs in by_entry.values() for job in jobs]
+    return 0 if set(states) == {"done"} else 2
+
+
+def _show_commands(
+    read: Plan, by_entry: dict[str, list[Planned]], overrides: Sequence[str]
+) -> None:
+    """The commands, each experiment's figure and cost above; what is done already is marked."""
+    from styleexp.reports import runs
+
+    given = [o.removeprefix("profile=") for o in overrides if o.startswith("profile=")]
+    profile = given[-1] if given else read.profile
+    total, seen = 0.0, set()
+    for entry in read.experiments:
+        assert entry.name is not None
+        minutes = entry.minutes.get(profile)
+        cost = "cost not known" if minutes is None else f"about {minutes:g} minutes on two cores"
+        total += minutes or 0
+        print(f"# {entry.name}{f', {entry.figure}' if entry.figure else ''}: {cost}")
+        for job in by_entry[entry.name]:
+            status = runs.read(job.folder)["status"]
+            note = "" if status == "missing" else f"  # {status}"
+            note = "  # the same job as above" if job.name in seen else note
+            seen.add(job.name)
+            print(job.command() + note)
+    print(f"# {len(seen)} jobs, about {total:g} minutes on two cores (profile={profile})")
+
+
+def _status(folder: Path) -> int:
+    from rich.console import Console
+    from rich.table import Table
+
+    from styleexp.reports import runs
+    from styleexp.sweeps import manifest
+
+    jobs = manifest.read(folder)
+    if not jobs:
+        raise UserError(f"'{folder}' is no plan's folder: it has no {manifest.NAME}.")
+    table = Table(title=str(folder))
+    for column in ("job", "state", "step", "attempts", "time"):
+        table.add_column(column, overflow="fold")
+    counts: Counter[str] = Counter()
+    for name, known in jobs.items():
+        run: dict[str, Any] = runs.read(folder / name)
+        state = "outdated" if known["state"] == "outdated" else str(run["status"])
+        state = "waiting" if state == "missing" else state
+        counts[state] += 1
+        seconds, total = run["seconds"], run.get("config.optim.steps")
+        table.add_row(
+            name,
+            state,
+            f"{runs.steps(folder / name)}/{total}" if total else "",
+            str(known.get("attempts", 0)),
+            f"{seconds:.0f} s" if isinstance(seconds, int | float) else "",
+        )
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=140)
+    console.print(table)
+    console.print(", ".join(f"{count} {state}" for state, count in counts.items()))
+    for name in jobs:
+        reason = runs.read(folder / name)["reason"]
+        if reason:
+            console.print(f"{name}: {reason}", markup=False, soft_wrap=True)
+    return 0
+
+
+def _collect(folder: Path) -> int:
+    from styleexp.reports.collect import collect, write
+
+    runs = collect(folder)
+    for path in write(runs, folder):
+        print(path)
+    print(", ".join(f"{count} {status}" for status, count in runs["status"].value_counts().items()))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

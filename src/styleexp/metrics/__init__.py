@@ -1,0 +1,116 @@
+"""What a result is worth: metrics that were themselves tested on known answers (docs/metrics.md).
+
+``measure`` is what every finished run is measured with.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from styleexp import meshes
+from styleexp.metrics.content import content, spike
+from styleexp.metrics.patches import Relief, closest, relief_of_mesh, relief_of_result
+from styleexp.metrics.style import (
+    Looks,
+    judged,
+    judged_plain,
+    judged_style,
+    relief_distance,
+    style_distance,
+)
+from styleexp.scene import pattern_unit
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
+    from styleexp.config import Config
+    from styleexp.encoders import Encoder
+
+
+@dataclass
+class Judge:
+    """An encoder that measures results, and what it remembers of the styles it saw."""
+
+    name: str
+    encoder: Encoder
+    windows: int = 32
+    plain: Looks = field(init=False)
+    styles: dict[object, Looks] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.plain = judged_plain(self.encoder)
+
+    def looks(self, config: Config, relief: Relief, unit: float) -> Looks:
+        """What a result's relief looks like, at places that its run's seed doesn't choose."""
+        return judged(relief, unit, self.encoder, self.windows, seed=config.optim.seed)
+
+    def style(self, config: Config, style: meshes.Mesh | np.ndarray, unit: float) -> Looks:
+        """What the style looks like; measured once for each style and size."""
+        key = (repr(config.style), config.loss.target, isinstance(style, np.ndarray) and unit)
+        if key not in self.styles:
+            self.styles[key] = judged_style(style, config, self.encoder, unit)
+        return self.styles[key]
+
+
+def choose_judge(name: str, trained: str | None, windows: int) -> Judge | None:
+    """The judge of that name. Downloads its weights where they aren't here yet.
+
+    ``auto`` is an encoder that the run was not ``trained`` with; ``none`` is None.
+    """
+    from styleexp.encoders import load_encoder
+
+    if name == "none":
+        return None
+    if name == "auto":
+        name = "vgg16" if trained == "vgg16_edges" else "vgg16_edges"
+    return Judge(name, load_encoder(name), windows)
+
+
+def measure(
+    config: Config,
+    source: meshes.Mesh,
+    style: meshes.Mesh | np.ndarray,
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    judge: Judge | None,
+) -> dict[str, float]:
+    """All metrics of a result in its source's frame; without a judge, those that need none.
+
+    ``style_distance`` 0 is the style itself, 1 no style at all (``metrics.style``);
+    ``relief_distance`` compares without a neural network; ``relief_rms`` is in radii of the
+    normalised source, ``relief_share`` its ratio to the style mesh's own. The content metrics are
+    ``metrics.content``'s.
+    """
+    unit = pattern_unit(config.style, source, style if isinstance(style, meshes.Mesh) else None)
+    found: dict[str, float] = {}
+    relief = relief_of_result(source, vertices, faces, unit)
+    found["relief_rms"] = _rms(relief.height)
+    if isinstance(style, meshes.Mesh):
+        found["relief_share"] = found["relief_rms"] / max(
+            unit * _rms(relief_of_mesh(style).height), 1e-12
+        )
+    if judge is not None:
+        looks = judge.looks(config, relief, unit)
+        goal = judge.style(config, style, unit)
+        found["style_distance"] = style_distance(looks, goal, judge.plain)
+        apart = relief_distance(looks, goal)
+        if apart is not None:
+            found["relief_distance"] = apart
+    return (
+        found | content(source, vertices, faces) | {"spike": spike(_moved(source, vertices, faces))}
+    )
+
+
+def _moved(source: meshes.Mesh, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """How far each vertex lies from where it was, or from the source's surface."""
+    base = source.vertices
+    if not np.array_equal(faces, source.faces):
+        base, _ = closest(source.vertices, source.faces, vertices)
+    return np.linalg.norm(vertices - base, axis=1)
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.square(values).mean()))

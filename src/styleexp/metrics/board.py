@@ -1,0 +1,125 @@
+"""Metrics of finished runs, one folder or many, read from what the runs saved."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from styleexp import meshes, records
+from styleexp.errors import UserError
+from styleexp.metrics import Judge, measure
+from styleexp.metrics.patches import relief_of_result
+from styleexp.metrics.style import Looks, appearance_distance
+from styleexp.scene import pattern_unit
+from styleexp.sources import load_source, load_style
+
+if TYPE_CHECKING:
+    from styleexp.config import Config
+
+
+def measure_run(folder: Path, judge: Judge | None) -> dict[str, float]:
+    """The metrics of a finished run, measured anew from ``result.ply``.
+
+    Raises `UserError` for a folder that is no run's, or whose run isn't done.
+    """
+    config, source, style, vertices, faces = _finished(folder)
+    return measure(config, source, style, vertices, faces, judge)
+
+
+def measure_board(folder: Path, judge: Judge) -> dict[str, Any]:
+    """Every run below ``folder``, and how well their styles can be told apart.
+
+    ``identification`` counts the runs whose result looks nearest to their own style among all
+    styles of the board, ``of`` how many were done; runs that weren't are listed as such.
+    """
+    rows: list[dict[str, Any]] = []
+    results: list[tuple[dict[str, Any], Looks]] = []
+    goals: dict[str, Looks] = {}
+    runs = sorted((path.parent for path in folder.rglob("run.json")), key=lambda p: str(p))
+    if not runs:
+        raise UserError(f"'{folder}' holds no run: give a run's or a sweep's folder.")
+    for run in runs:
+        row: dict[str, Any] = {"run": str(run.relative_to(folder))}
+        rows.append(row)
+        try:
+            config, source, style, vertices, faces = _finished(run)
+        except UserError as error:
+            row["status"] = str(error)
+            continue
+        name = config.style.path or str(config.style.name)
+        row |= {"status": "done", "source": source.name, "style": name}
+        row |= measure(config, source, style, vertices, faces, judge)
+        unit = unit_of(config, source, style)
+        goals.setdefault(name, judge.style(config, style, unit))
+        relief = relief_of_result(source, vertices, faces, unit)
+        results.append((row, judge.looks(config, relief, unit)))
+    for row, looks in results:
+        far = {name: appearance_distance(looks, goal) for name, goal in goals.items()}
+        row["looks_like"] = min(far, key=lambda name: far[name])
+    done = [row for row, _ in results]
+    return {
+        "identification": sum(row["looks_like"] == row["style"] for row in done),
+        "of": len(done),
+        "styles": len(goals),
+        "min_silhouette_iou": min((row["silhouette_iou"] for row in done), default=None),
+        "max_flipped": max((row.get("flipped_faces", 0.0) for row in done), default=None),
+        "max_spike": max((row["spike"] for row in done), default=None),
+        "runs": rows,
+    }
+
+
+def unit_of(config: Config, source: meshes.Mesh, style: meshes.Mesh | np.ndarray) -> float:
+    """The pattern's size on the normalised source."""
+    return pattern_unit(config.style, source, style if isinstance(style, meshes.Mesh) else None)
+
+
+def _finished(
+    folder: Path,
+) -> tuple[Config, meshes.Mesh, meshes.Mesh | np.ndarray, np.ndarray, np.ndarray]:
+    """Configuration, source, style and result of a run that is done."""
+    from omegaconf import OmegaConf
+
+    from styleexp import compose
+
+    record = records.read_record(folder, "measure")
+    try:
+        status = json.loads((folder / "status.json").read_text(encoding="utf-8"))["status"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"'{folder}/status.json' cannot be read ({error}).") from error
+    if status != "done":
+        raise UserError(f"the run in '{folder}' is {status}, not done: there is no result yet.")
+    compose.register()
+    config = compose.typed(OmegaConf.create(record["config"]))
+    source, style = load_source(config.source), load_style(config.style)
+    return config, source, style, *read_result(folder / "result.ply", source)
+
+
+def read_result(path: Path, source: meshes.Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of a result's file, with the source's own numbering where they are its.
+
+    A file may hold the source's vertices, or its file's rows, in which vertices are split at seams;
+    anything else is another topology and is taken as it stands.
+    """
+    result = meshes.load_mesh(path)
+    if len(result.vertices) == len(source.vertices) and len(result.faces) == len(source.faces):
+        rows = _rows(path)
+        if len(rows) == len(source.vertices):
+            return rows, source.faces
+    if source.carrier is not None:
+        rows = _rows(path)
+        if len(rows) == len(source.carrier.rows):
+            vertices = np.empty_like(source.vertices)
+            vertices[source.carrier.rows] = rows
+            return vertices, source.faces
+    return result.vertices, result.faces
+
+
+def _rows(path: Path) -> np.ndarray:
+    """Vertices in the order of the file."""
+    import trimesh
+
+    loaded = trimesh.load(path, process=False, force="mesh")
+    return np.asarray(loaded.vertices, dtype=np.float64)

@@ -1,0 +1,254 @@
+"""The metrics' own test: results whose style is known, since it was put there by formula.
+
+On every source each analytic style's relief is laid directly, at the style's own scale: from three
+sides, as one would wrap a solid, with no rendering and no learning. Beside it come distractors: the
+same style at half and at double its scale, a quarter of its height, noise of the same energy and
+frequency, the plain source, a shrunken one. A metric of style has to call the true style nearest,
+to find no style where there is none, and to prefer the right scale.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from styleexp import meshes, shapes
+from styleexp.config import FieldConfig, StyleConfig
+from styleexp.encoders import load_encoder
+from styleexp.losses import gram_matrix, layer_mask
+from styleexp.metrics.patches import WINDOW, Relief, relief_of_mesh, relief_of_result, windows
+from styleexp.metrics.style import (
+    LAYERS,
+    Looks,
+    appearance_distance,
+    height_grams,
+    judged,
+    judged_plain,
+    relief_distance,
+    style_distance,
+)
+from styleexp.renderers.base import Shading
+from styleexp.renderers.soft_raster import SoftRaster
+from styleexp.scene import choose_field, pattern_unit
+from styleexp.views import orbit
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+    from styleexp.encoders import Encoder
+    from styleexp.losses import Grams
+
+SHARPNESS = 6
+"""Exponent of the normal's components that the three projections are blended by."""
+BELT = 0.9
+"""Radians of latitude around the style's equator that are used; mirrored beyond."""
+SHRINKAGE = 0.03
+"""Of the shrunken source, in radii."""
+ENOUGH = 0.95
+"""Share of the cases in which a metric must be right to be kept."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What a candidate metric may look at."""
+
+    looks: Looks
+    """By the judging encoder."""
+    random: Grams
+    """Of the height images, by an encoder with random weights."""
+    views: Grams
+    """Of whole renders, foreground alone."""
+
+
+@dataclass
+class Board:
+    """Every case, measured."""
+
+    styles: dict[str, Sample] = field(default_factory=dict)
+    plain: Sample | None = None
+    own: dict[str, Sample] = field(default_factory=dict)
+    """The plain sources."""
+    cases: dict[tuple[str, str, str], Sample] = field(default_factory=dict)
+    """By source, style and what was put there."""
+
+
+Metric = Callable[[Sample, Sample, Sample, Sample], float]
+"""Of a result, a style, a surface without relief, and the plain source."""
+
+CANDIDATES: dict[str, Metric] = {
+    "style_distance": lambda r, s, p, own: style_distance(r.looks, s.looks, p.looks),
+    "relief_distance": lambda r, s, p, own: relief_distance(r.looks, s.looks) or 0.0,
+    "appearance_distance": lambda r, s, p, own: appearance_distance(r.looks, s.looks),
+    "random_style_distance": lambda r, s, p, own: _ratio(r.random, s.random, p.random),
+    "view_distance": lambda r, s, p, own: _ratio(r.views, s.views, own.views),
+}
+"""Smaller is nearer. The last two are what others do; they are here to be compared with."""
+
+
+def wrapped(
+    name: str,
+    points: Float[np.ndarray, "points 3"],
+    normals: Float[np.ndarray, "points 3"],
+    unit: float,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, " points"]:
+    """The relief of an analytic style on another surface; ``unit`` is the style's radius there.
+
+    Around its equator the style's sphere is rolled out onto each of three planes, and the three
+    heights are blended by the normal; +Y stays up where it can.
+    """
+    weights = np.abs(normals) ** SHARPNESS
+    weights /= weights.sum(axis=1, keepdims=True)
+    total = np.zeros(len(points))
+    for axis, (right, up, turn) in enumerate(((2, 1, -1.0), (0, 2, -1.0), (0, 1, 1.0))):
+        side = np.where(normals[:, axis] < 0, -turn, turn)
+        longitude = side * points[:, right] / unit + rng.uniform(0, 2 * math.pi)
+        rolled = np.mod(points[:, up] / unit + rng.uniform(0, 4 * BELT), 4 * BELT)
+        latitude = np.where(rolled < 2 * BELT, rolled - BELT, 3 * BELT - rolled)
+        directions = np.stack(
+            [
+                np.sin(longitude) * np.cos(latitude),
+                np.sin(latitude),
+                np.cos(longitude) * np.cos(latitude),
+            ],
+            axis=1,
+        )
+        seen = weights[:, axis] > 1e-3
+        total[seen] += weights[seen, axis] * shapes.relief(name, directions[seen])
+    return unit * total
+
+
+def noise(
+    points: Float[np.ndarray, "points 3"], frequency: float, rng: np.random.Generator
+) -> Float[np.ndarray, " points"]:
+    """A random field of that many cycles per unit length, root mean square 1."""
+    waves = rng.normal(size=(256, 3)) * frequency * 2 * math.pi
+    total = np.cos(points @ waves.T + rng.uniform(0, 2 * math.pi, 256)).sum(axis=1)
+    total -= total.mean()
+    return total / total.std()
+
+
+def cases(
+    source: meshes.Mesh, style: str, unit: float, frequency: float, seed: int
+) -> Iterator[tuple[str, Float[np.ndarray, " vertices"]]]:
+    """(what it is, displacement of every vertex in radii) for a source in the unit sphere.
+
+    ``frequency`` is the style's, in cycles per radius of its own.
+    """
+    rng = np.random.default_rng(seed)
+    normals = meshes.vertex_normals(source.vertices, source.faces)
+    true = wrapped(style, source.vertices, normals, unit, rng)
+    yield "true", true
+    yield "faint", 0.25 * true
+    yield "half", wrapped(style, source.vertices, normals, unit / 2, rng)
+    yield "double", wrapped(style, source.vertices, normals, unit * 2, rng)
+    yield "noise", true.std() * noise(source.vertices, frequency / unit, rng)
+    yield "shrunken", np.full(len(true), -SHRINKAGE)
+
+
+def measure_board(
+    sources: list[meshes.Mesh], judge: str, count: int, told: Callable[[str], None]
+) -> Board:
+    """Put every style on every source, with its distractors, and let the encoders look."""
+    encoder = load_encoder(judge)
+    random = load_encoder("vgg19_random")
+
+    def sample(relief: Relief, unit: float, vertices: np.ndarray, faces: np.ndarray) -> Sample:
+        return Sample(
+            judged(relief, unit, encoder, count),
+            height_grams(random, windows(relief, WINDOW * unit, count)),
+            _view_grams(encoder, vertices, faces),
+        )
+
+    board = Board()
+    styles = {name: shapes.make(name) for name in shapes.STYLES}
+    frequencies = {name: choose_field(FieldConfig(), style)[0] for name, style in styles.items()}
+    for name, style in styles.items():
+        vertices = meshes.normalisation(style.vertices).apply(style.vertices)
+        board.styles[name] = sample(relief_of_mesh(style), 1.0, vertices, style.faces)
+    height = judged_plain(random).height
+    assert height is not None
+    board.plain = Sample(judged_plain(encoder), height, [])
+    for number, given in enumerate(sources):
+        frame = meshes.normalisation(given.vertices)
+        source = meshes.Mesh(given.name, frame.apply(given.vertices), given.faces)
+        normals = meshes.vertex_normals(source.vertices, source.faces)
+        still = Relief(source.vertices, source.faces, np.zeros(len(normals)))
+        board.own[given.name] = sample(still, 1.0, source.vertices, source.faces)
+        for style_number, (name, style) in enumerate(styles.items()):
+            unit = pattern_unit(StyleConfig(), source, style)
+            seed = 100 * number + style_number
+            for what, moved in cases(source, name, unit, frequencies[name], seed):
+                vertices = source.vertices + moved[:, None] * normals
+                relief = relief_of_result(source, vertices, source.faces, unit)
+                board.cases[given.name, name, what] = sample(relief, unit, vertices, source.faces)
+            told(f"{given.name}, {name}")
+    return board
+
+
+def judge_metrics(board: Board) -> dict[str, dict[str, Any]]:
+    """How often each candidate is right, as shares of the cases.
+
+    ``rank1``: the true style is the nearest of all. ``scale``: the style at its own scale is nearer
+    than at half and double. ``noise``, ``strength``: nearer than noise, and than at a quarter of
+    its height. ``no_style``: the shrunken source is farther than the true result and, for the
+    metrics that are ratios, within a tenth of 1. ``confusions`` lists what went wrong.
+    """
+    return {name: _verdict(metric, board) for name, metric in CANDIDATES.items()}
+
+
+def _verdict(metric: Metric, board: Board) -> dict[str, Any]:
+    right = dict.fromkeys(("rank1", "scale", "noise", "strength", "no_style"), 0)
+    confusions = []
+    true = [key for key in board.cases if key[2] == "true"]
+    plain = board.plain
+    assert plain is not None
+    ratio = metric not in (CANDIDATES["relief_distance"], CANDIDATES["appearance_distance"])
+    for source, style, _ in true:
+
+        def far(what: str, goal: str = "", source: str = source, style: str = style) -> float:
+            found = board.cases[source, style, what]
+            return metric(found, board.styles[goal or style], plain, board.own[source])
+
+        value = far("true")
+        nearest = min(board.styles, key=lambda goal: far("true", goal))
+        right["rank1"] += nearest == style
+        right["scale"] += value < min(far("half"), far("double"))
+        right["noise"] += value < far("noise")
+        right["strength"] += value < far("faint")
+        nothing = far("shrunken")
+        right["no_style"] += nothing > value and (not ratio or abs(nothing - 1) < 0.1)
+        if nearest != style:
+            confusions.append(f"{source}: {style} taken for {nearest}")
+    shares = {key: count / len(true) for key, count in right.items()}
+    kept = min(shares["rank1"], shares["scale"], shares["no_style"]) >= ENOUGH
+    return {**shares, "kept": kept, "confusions": confusions}
+
+
+@torch.no_grad()
+def _view_grams(encoder: Encoder, vertices: np.ndarray, faces: np.ndarray) -> Grams:
+    """Grams of six whole views, foreground alone and eroded: what a run's loss looks at."""
+    azimuth = torch.arange(6) * (math.pi / 3) + 0.3
+    cameras = orbit(torch.full_like(azimuth, 0.2), azimuth, 2.0, 60.0)
+    shading = Shading(normals="smooth", background=0.35, outlines=False)
+    out = SoftRaster().render(
+        torch.from_numpy(vertices).float(), torch.from_numpy(faces), cameras, shading, (224, 224)
+    )
+    features = encoder(out.image.permute(0, 3, 1, 2).expand(-1, 3, -1, -1), list(LAYERS))
+    return [
+        gram_matrix(f.float(), layer_mask(out.coverage, (f.shape[2], f.shape[3]), erosion=2))
+        for f in (features[layer] for layer in LAYERS)
+    ]
+
+
+def _ratio(result: Grams, style: Grams, own: Grams) -> float:
+    parts = [
+        (a - b).square().sum() / (o - b).square().sum().clamp(min=1e-20)
+        for a, b, o in zip(result, style, own, strict=True)
+    ]
+    return float(torch.stack(parts).mean())

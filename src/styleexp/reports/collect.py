@@ -1,0 +1,101 @@
+"""All runs below a folder as one tidy table."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from styleexp.errors import UserError
+from styleexp.reports import runs
+
+if TYPE_CHECKING:
+    import pandas
+
+FIRST = ("run", "status", "seconds", "reason", "device", "loss")
+"""Columns that stand first."""
+
+
+def collect(folder: str | Path) -> pandas.DataFrame:
+    """One row for each run below ``folder``, those that failed or never began included.
+
+    Columns: ``run`` (its folder, relative), ``status``, ``seconds``, ``reason``, ``device``,
+    ``loss`` (mean of the last tenth of the steps), ``config.*``, ``metric.*``, ``version.*``,
+    ``asset.*`` (sha256), ``experiment`` where a plan names it. ``status`` is the run's own; or
+    ``missing``, planned but never begun; ``died``, its process was killed; ``outdated``, its plan
+    was changed since. Keys of lists are JSON. Raises `UserError` without pandas (extra ``report``)
+    and for no folder.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise UserError(f"there is no folder '{folder}' to collect runs from.")
+    try:
+        import pandas
+    except ImportError:
+        raise UserError("collecting needs pandas: pip install 'styleexp[report]'.") from None
+    rows = []
+    for run, more in sorted(_runs(folder).items()):
+        rows.append({"run": run, **runs.read(folder / run), **more})
+    frame = pandas.DataFrame(rows, columns=None if rows else list(FIRST))
+    rest = sorted(column for column in frame.columns if column not in FIRST)
+    return frame.reindex(columns=[*FIRST, *rest])
+
+
+def write(frame: pandas.DataFrame, folder: str | Path) -> list[Path]:
+    """Write ``runs.csv`` and ``runs.parquet``; returns their paths.
+
+    Parquet columns have one type each: a column of mixed types is written as text.
+    """
+    from styleexp.records import RunFolder
+
+    target = RunFolder(Path(folder))
+    typed = frame.copy()
+    for name in typed.columns:
+        kinds = {type(value) for value in typed[name].dropna()}
+        if len(kinds - {int, float}) > (0 if kinds & {int, float} else 1):
+            typed[name] = typed[name].map(str, na_action="ignore")
+    try:
+        parquet = target.write("runs.parquet", lambda path: typed.to_parquet(path, index=False))
+    except ImportError:
+        raise UserError("Parquet needs pyarrow: pip install 'styleexp[report]'.") from None
+    return [target.write("runs.csv", lambda path: frame.to_csv(path, index=False)), parquet]
+
+
+def _runs(folder: Path) -> dict[str, dict[str, str]]:
+    """The runs that are, or should be, below a folder, and what is known of them from outside."""
+    from styleexp.sweeps import manifest
+    from styleexp.sweeps.report import JOBS, planned
+
+    found: dict[str, dict[str, str]] = {run: {} for run in _begun(folder)}
+    for path in sorted(folder.rglob(JOBS)):
+        for job in planned(path.parent):
+            found.setdefault(str(job.folder.relative_to(folder)), {})
+    for path in sorted(folder.rglob(manifest.NAME)):
+        jobs, below = manifest.read(path.parent), path.parent.relative_to(folder)
+        for name, listed in jobs.items():
+            run, outdated = str(below / name), listed["state"] == "outdated"
+            if outdated and run not in found:
+                continue
+            known = found.setdefault(run, {})
+            known["experiment"] = listed.get("experiment", "")
+            if outdated:
+                known["status"] = "outdated"
+    return found
+
+
+def _begun(folder: Path) -> Iterator[str]:
+    """Folders with a run's record or status; a run has no runs below it."""
+    for at, folders, files in os.walk(folder):
+        if "status.json" in files or ("run.json" in files and _is_record(Path(at) / "run.json")):
+            folders.clear()
+            yield str(Path(at).relative_to(folder))
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+
+
+def _is_record(path: Path) -> bool:
+    try:
+        return "config" in json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False

@@ -1,0 +1,98 @@
+"""One run's folder as a flat row. Needs nothing but the standard library."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from styleexp import locks
+
+FINAL_SHARE = 10
+"""The final loss is the mean over the last tenth of the steps."""
+
+
+def read(folder: Path) -> dict[str, Any]:
+    """What is known of a run: ``status``, ``seconds``, ``reason``, ``loss``, ``metric.*``,
+    ``config.*``, ``version.*``, ``device``, ``asset.*`` (sha256, or the name of what has no file).
+
+    ``status`` is the run's own (see ``RunFolder.write_status``), ``missing`` where there is none,
+    ``died`` where a run calls itself running but no process is at it. Nothing raises: what can't be
+    read is left out, and ``reason`` says so.
+    """
+    faults: list[str] = []
+    told = _json(folder / "status.json", faults)
+    record = _json(folder / "run.json", faults)
+    metrics = _json(folder / "metrics.json", faults)
+    row: dict[str, Any] = {
+        "status": told.get("status", "unreadable" if faults else "missing"),
+        "seconds": told.get("seconds"),
+        "device": record.get("device"),
+        "loss": _final_loss(folder / "metrics.jsonl"),
+    }
+    if row["status"] == "running" and not locks.held(folder):
+        row["status"] = "died"
+    row["reason"] = "; ".join([*filter(None, [told.get("reason")]), *faults]) or None
+    row |= {f"metric.{name}": value for name, value in metrics.items() if _plain(value)}
+    row |= {f"config.{key}": value for key, value in _flat(record.get("config") or {})}
+    row |= {f"version.{name}": v for name, v in (record.get("versions") or {}).items()}
+    for role, asset in (record.get("assets") or {}).items():
+        row[f"asset.{role}"] = asset.get("sha256") or asset.get("name")
+    return row
+
+
+def status(folder: Path) -> str | None:
+    """A run's status as it wrote it; None where it wrote none that can be read."""
+    return _json(folder / "status.json", []).get("status")
+
+
+def steps(folder: Path) -> int:
+    """How many steps a run has noted."""
+    try:
+        return (folder / "metrics.jsonl").read_bytes().count(b"\n")
+    except OSError:
+        return 0
+
+
+def _json(path: Path, faults: list[str]) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        faults.append(f"{path.name} can't be read ({error})")
+        return {}
+    if not isinstance(content, dict):
+        faults.append(f"{path.name} can't be read (it holds no object)")
+        return {}
+    return content
+
+
+def _flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted keys; lists as JSON, so that a column has one type."""
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, json.dumps(value) if isinstance(value, list) else value
+
+
+def _plain(value: Any) -> bool:
+    return isinstance(value, int | float | str) or value is None
+
+
+def _final_loss(path: Path) -> float | None:
+    """Mean loss of the last tenth of the steps; lines cut off by a kill don't count."""
+    losses = []
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, ValueError):
+        return None
+    last = lines[-max(1, len(lines) // FINAL_SHARE) :]
+    for line in last:
+        try:
+            losses.append(float(json.loads(line)["loss"]))
+        except (ValueError, KeyError, TypeError):
+            continue
+    return sum(losses) / len(losses) if losses else None

@@ -1,0 +1,222 @@
+"""A sweep's contact sheet, laid out like the paper's figures: source, style, settings."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from styleexp.records import RunFolder
+from styleexp.reports import runs
+from styleexp.sweeps.jobs import Job, setting, varying
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+    from styleexp.config import Config
+
+COLUMNS = 6
+"""Pictures in a line, at most, where settings would make it longer."""
+PAIRS = 2
+"""Pairs of source and style in a line, where each has one result."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What the layout needs to know of a job."""
+
+    source: str
+    style: str
+    setting: str
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One picture of the sheet."""
+
+    kind: str
+    """``source``, ``style`` or ``result``."""
+    job: int
+    caption: str
+
+
+Line = list[Cell | None]
+
+
+def layout(shown: Sequence[Shown]) -> list[Line]:
+    """The sheet's lines.
+
+    Settings that vary: source, style, and a column for each setting (Figs. 7, 8). All pairs of some
+    sources and styles: a grid with styles above and sources on the left (Figs. 2, 3). Other pairs:
+    source, style, result (Fig. 9).
+    """
+    pairs: dict[tuple[str, str], list[int]] = {}
+    for index, each in enumerate(shown):
+        pairs.setdefault((each.source, each.style), []).append(index)
+    sources = list(dict.fromkeys(each.source for each in shown))
+    styles = list(dict.fromkeys(each.style for each in shown))
+    if any(each.setting for each in shown) or len(pairs) < len(shown):
+        return [line for jobs in pairs.values() for line in _settings(shown, jobs)]
+    if len(shown) > 1 and len(pairs) == len(sources) * len(styles):
+        return _grid(shown, pairs, sources, styles)
+    cells = [
+        cell
+        for jobs in pairs.values()
+        for cell in (*_given(shown, jobs[0]), *_results(shown, jobs))
+    ]
+    return [list(cells[at : at + 3 * PAIRS]) for at in range(0, len(cells), 3 * PAIRS)]
+
+
+def _settings(shown: Sequence[Shown], jobs: Sequence[int]) -> list[Line]:
+    results, width = _results(shown, jobs), COLUMNS - 2
+    lines: list[Line] = []
+    for at in range(0, len(results), width):
+        before: Line = [None, None] if at else _given(shown, jobs[0])
+        lines.append([*before, *results[at : at + width]])
+    return lines
+
+
+def _grid(
+    shown: Sequence[Shown],
+    pairs: dict[tuple[str, str], list[int]],
+    sources: Sequence[str],
+    styles: Sequence[str],
+) -> list[Line]:
+    first: Line = [None]
+    first += [Cell("style", pairs[sources[0], style][0], style) for style in styles]
+    lines = [first]
+    for source in sources:
+        jobs = [pairs[source, style][0] for style in styles]
+        line: Line = [Cell("source", jobs[0], source)]
+        lines.append(
+            [*line, *(Cell("result", job, f"{source}, {shown[job].style}") for job in jobs)]
+        )
+    return lines
+
+
+def _given(shown: Sequence[Shown], job: int) -> Line:
+    return [
+        Cell("source", job, f"source: {shown[job].source}"),
+        Cell("style", job, f"style: {shown[job].style}"),
+    ]
+
+
+def _results(shown: Sequence[Shown], jobs: Sequence[int]) -> list[Cell]:
+    return [Cell("result", job, shown[job].setting or "result") for job in jobs]
+
+
+# ------------------------------------------------------------------------------------ pictures
+
+
+def write_figure(jobs: Sequence[Job], folder: RunFolder) -> None:
+    """Draw ``figure.png``; a job without a result has its status in the picture's place."""
+    told = varying([job.overrides for job in jobs])
+    configs = [_config(job) for job in jobs]
+    shown = [
+        Shown(_name(config.source), _name(config.style), setting(overrides))
+        for config, overrides in zip(configs, told, strict=True)
+    ]
+    if not jobs:
+        return
+    size = max(config.preview.resolution for config in configs)
+    drawn: dict[Any, Image.Image | str] = {}
+
+    def picture(cell: Cell) -> Image.Image | str:
+        config = configs[cell.job]
+        part = config.source if cell.kind == "source" else config.style
+        key = (cell.kind, repr(part)) if cell.kind != "result" else (cell.kind, cell.job)
+        if key not in drawn:
+            drawn[key] = _picture(cell.kind, config, jobs[cell.job].folder, size)
+        return drawn[key]
+
+    lines = [
+        [(cell.caption, picture(cell)) if cell else None for cell in line] for line in layout(shown)
+    ]
+    folder.write("figure.png", lambda path: _sheet(lines, size).save(path))
+
+
+def _config(job: Job) -> Config:
+    """A job's configuration, from its record or, where it never began, from its overrides."""
+    from omegaconf import OmegaConf
+
+    from styleexp import compose
+
+    try:
+        record = json.loads((job.folder / "run.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return compose.compose([*job.overrides, "hydra.mode=RUN"])
+    compose.register()
+    return compose.typed(OmegaConf.create(record["config"]))
+
+
+def _name(part: Any) -> str:
+    name = Path(part.path).stem if part.path else str(part.name)
+    return name if getattr(part, "scale", 1.0) == 1.0 else f"{name}, scale {part.scale:g}"
+
+
+def _picture(kind: str, config: Config, folder: Path, size: int) -> Image.Image | str:
+    """A picture no larger than ``size``, or words where there is none."""
+    import numpy as np
+    from PIL import Image
+
+    from styleexp import meshes, sources
+    from styleexp.errors import UserError
+
+    try:
+        if kind == "source":
+            content: Any = sources.load_source(config.source)
+        elif kind == "style":
+            content = sources.load_style(config.style)
+        else:
+            status = runs.read(folder)["status"]
+            if status != "done":
+                return str(status)
+            content = meshes.load_mesh(folder / "result.ply")
+    except UserError as error:
+        return "not found" if kind != "result" else str(error).split(":")[0]
+    if isinstance(content, meshes.Mesh):
+        return _view(content, size)
+    picture = Image.fromarray((content * 255).round().astype(np.uint8)).convert("L")
+    picture.thumbnail((size, size))
+    return picture
+
+
+def _view(mesh: Any, size: int) -> Image.Image:
+    from PIL import Image
+
+    from styleexp import meshes, previews
+
+    _, elevation, azimuth = previews.VIEWS[0]
+    vertices = meshes.normalisation(mesh.vertices).apply(mesh.vertices)
+    view = previews.render_views(vertices, mesh.faces, [elevation], [azimuth], size)
+    return Image.fromarray(view[0])
+
+
+def _sheet(lines: list[list[tuple[str, Image.Image | str] | None]], size: int) -> Image.Image:
+    """Captioned pictures in lines; a caption that is too long for its picture is cut."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    band = max(16, size // 12)
+    font = ImageFont.load_default(size=band * 0.62)
+    columns = max(len(line) for line in lines)
+    sheet = Image.new("L", (columns * size, len(lines) * (size + band)), 255)
+    draw = ImageDraw.Draw(sheet)
+    for row, line in enumerate(lines):
+        top = row * (size + band)
+        for column, cell in enumerate(line):
+            if cell is None:
+                continue
+            caption, picture = cell
+            left = column * size
+            while len(caption) > 1 and draw.textlength(caption, font) > size - band * 0.4:
+                caption = caption.rstrip("…")[:-1] + "…"
+            draw.text((left + size / 2, top + band / 2), caption, fill=20, font=font, anchor="mm")
+            if isinstance(picture, str):
+                centre = (left + size / 2, top + band + size / 2)
+                draw.text(centre, picture, fill=90, font=font, anchor="mm")
+            else:
+                corner = (left + (size - picture.width) // 2, top + band)
+                sheet.paste(picture, (corner[0], corner[1] + (size - picture.height) // 2))
+    return sheet

@@ -1,0 +1,76 @@
+"""Hydra's launchers: how many jobs run side by side, and how many threads each gets."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from styleexp.errors import UserError
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+JOBS = {
+    "joblib": "hydra.launcher.n_jobs",
+    "submitit_local": "hydra.sweeper.max_batch_size",
+    "submitit_slurm": "hydra.launcher.array_parallelism",
+    "ray": "hydra.launcher.ray.init.num_cpus",
+}
+"""The key of each launcher that says how many jobs run at once."""
+
+
+def overrides(name: str, jobs: int | None = None) -> list[str]:
+    """The overrides that choose a launcher, and how many jobs it runs side by side."""
+    if jobs is None:
+        return [f"launcher={name}"]
+    if name not in JOBS or jobs < 1:
+        raise UserError(
+            f"--jobs {jobs} can't be done with the launcher '{name}': choose --launcher joblib and "
+            "a number from 1."
+        )
+    return [f"launcher={name}", f"{JOBS[name]}={jobs}"]
+
+
+def batch_size(hydra: Any) -> int | None:
+    """How many jobs the launcher may be given at once; None for any number."""
+    return side_by_side(hydra) if _kind(hydra) == "submitit_local" else None
+
+
+def side_by_side(hydra: Any) -> int:
+    """Jobs that run at once on one machine, by Hydra's configuration (``hydra.launcher``)."""
+    kind = _kind(hydra)
+    if kind == "joblib":
+        jobs = int(hydra.launcher.n_jobs)
+        return jobs if jobs > 0 else max(1, cores() + 1 + jobs)  # joblib: -1 is all cores
+    if kind == "submitit_local":
+        return int(hydra.sweeper.get("max_batch_size") or 1)
+    return 1
+
+
+def threads_each(hydra: Any) -> int:
+    """Threads for each job, so that jobs side by side don't fight for cores; 0 takes all cores."""
+    kind = _kind(hydra)
+    if kind == "submitit_slurm":
+        return int(hydra.launcher.cpus_per_task or 0)
+    if kind == "ray":
+        return int(hydra.launcher.ray.remote.get("num_cpus") or 0)
+    jobs = side_by_side(hydra)
+    return max(1, cores() // jobs) if jobs > 1 else 0
+
+
+def _kind(hydra: Any) -> str:
+    target = str(hydra.launcher._target_)
+    for word, kind in (
+        ("LocalLauncher", "submitit_local"),
+        ("SlurmLauncher", "submitit_slurm"),
+        ("joblib", "joblib"),
+        ("Ray", "ray"),
+    ):
+        if word in target:
+            return kind
+    return "basic"

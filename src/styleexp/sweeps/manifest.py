@@ -1,0 +1,77 @@
+"""What a plan's folder holds: every job with its key, state and folder, in ``manifest.json``.
+
+The truth about a job is in its own folder: the status that it wrote, and the lock that its process
+holds. The manifest is for people and for what comes after; it is written under a lock of its own.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from styleexp import locks, records
+from styleexp.errors import UserError
+from styleexp.reports import runs
+from styleexp.sweeps.plan import Planned
+
+NAME = "manifest.json"
+SCHEMA = 1
+PATIENCE = 60.0
+"""Seconds to wait for the manifest's lock."""
+ENDED = ("done", "failed")
+"""States in which a job stays."""
+
+
+def write(folder: Path, jobs: Iterable[Planned]) -> None:
+    """Note the jobs of a plan; what the folder holds of other plans, or of this one before it was
+    changed, is marked as outdated."""
+    with locks.hold(folder, PATIENCE):
+        before = read(folder)
+        listed = {}
+        for job in jobs:
+            known = before.pop(job.name, {})
+            listed[job.name] = {
+                "key": job.key,
+                "experiment": job.entry,
+                "overrides": list(job.overrides),
+                "state": runs.read(job.folder)["status"],
+                "attempts": known.get("attempts", 0),
+            } | {k: known[k] for k in ("host", "process", "changed") if k in known}
+        for name, known in before.items():
+            listed.setdefault(name, {**known, "state": "outdated"})
+        _write(folder, listed)
+
+
+def read(folder: Path) -> dict[str, dict[str, Any]]:
+    """The manifest's jobs, by their folder below the plan's; empty where there is none."""
+    path = folder / NAME
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise UserError(f"'{path}' can't be read ({error}): remove it; runs are kept.") from error
+    if content.get("schema") != SCHEMA:
+        raise UserError(f"'{path}' was written by another version: choose another --folder.")
+    return dict(content["jobs"])
+
+
+def update(folder: Path, name: str, state: str) -> dict[str, dict[str, Any]]:
+    """Note a job's new state, and where it runs; returns all jobs."""
+    with locks.hold(folder, PATIENCE):
+        jobs = read(folder)
+        job = jobs.setdefault(name, {})
+        job |= {"state": state, "changed": records.now()}
+        if state == "running":
+            job |= {"host": platform.node(), "process": os.getpid()}
+            job["attempts"] = job.get("attempts", 0) + 1
+        _write(folder, jobs)
+        return jobs
+
+
+def _write(folder: Path, jobs: dict[str, dict[str, Any]]) -> None:
+    records.RunFolder(folder).write_json(NAME, {"schema": SCHEMA, "jobs": jobs})

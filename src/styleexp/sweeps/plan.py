@@ -1,0 +1,230 @@
+"""Plans: which experiments, with which seeds and sizes, in which order.
+
+A plan is a YAML file (``sweeps/*.yaml``)::
+
+    profile: fast                 # of every job; on the command line: profile=standard
+    launcher: basic               # an option of conf/launcher
+    seeds: [0]                    # optim.seed, where an experiment sweeps none itself
+    overrides: [encoder=vgg16]    # of every job
+    experiments:
+      - experiment: sigma_ablation          # one of conf/experiment, swept as it says
+        figure: Fig. 7
+        minutes: {fast: 3, standard: 8}     # what all its jobs take on two cores
+      - name: pairs                         # or without an experiment
+        pairs: [[spot, stripe], [bunny, bubble]]    # source and style, not their product
+        overrides: ["field.sigma=1,5"]
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import re
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from dataclasses import field as option
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from styleexp.errors import UserError, unknown_name
+from styleexp.records import essence
+from styleexp.sweeps.jobs import Job, product, varying
+
+if TYPE_CHECKING:
+    from styleexp.config import Config
+
+
+@dataclass
+class Entry:
+    """One experiment of a plan."""
+
+    experiment: str | None = None
+    name: str | None = None
+    """Of its folder; the experiment's if not given."""
+    figure: str = ""
+    """The paper's figure that it is for."""
+    minutes: dict[str, float] = option(default_factory=dict)
+    """What all its jobs take on two cores, by profile."""
+    overrides: list[str] = option(default_factory=list)
+    pairs: list[list[str]] = option(default_factory=list)
+    """Pairs of source and style."""
+    seeds: list[int] | None = None
+    """Instead of the plan's."""
+
+
+@dataclass
+class Plan:
+    """Experiments in their order."""
+
+    experiments: list[Entry]
+    profile: str = "standard"
+    launcher: str = "basic"
+    seeds: list[int] = option(default_factory=list)
+    overrides: list[str] = option(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Planned(Job):
+    """A job of a plan. ``name`` is its folder below the plan's."""
+
+    key: str
+    """Hash of its resolved configuration and of the files of its source and style."""
+    entry: str
+
+    def command(self) -> str:
+        """The command that does the same."""
+        target = f"hydra.run.dir={quoted(str(self.folder))}"
+        return shlex.join(["styleexp", *self.overrides, "hydra.mode=RUN", target])
+
+
+def read(path: Path) -> Plan:
+    """Read and check a plan. Raises `UserError` for what it can't be."""
+    import yaml
+
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UserError(f"there is no plan '{path}': give a YAML file, see sweeps/.") from None
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        told = " ".join(str(error).split())
+        raise UserError(f"the plan '{path}' can't be read: {told}.") from error
+    if not isinstance(content, dict) or not content.get("experiments"):
+        raise UserError(f"the plan '{path}' names no experiments: see sweeps/ for examples.")
+    entries = []
+    for number, each in enumerate(content["experiments"], 1):
+        entry = _typed(Entry, each, f"experiment {number} of '{path}'")
+        if entry.name is None and entry.experiment is None:
+            raise UserError(f"experiment {number} of '{path}' has no experiment and no name.")
+        if any(len(pair) != 2 for pair in entry.pairs):
+            raise UserError(f"experiment {number} of '{path}': pairs are [source, style].")
+        entries.append(dataclasses.replace(entry, name=entry.name or entry.experiment))
+    names = [entry.name for entry in entries]
+    for name in names:
+        if names.count(name) > 1:
+            raise UserError(f"the plan '{path}' has '{name}' twice: give each its own name.")
+    return _typed(Plan, {**content, "experiments": entries}, f"'{path}'")
+
+
+def _typed(schema: Any, content: Any, where: str) -> Any:
+    """The dataclass of a mapping, its keys and types checked."""
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    known = [each.name for each in dataclasses.fields(schema)]
+    if not isinstance(content, dict):
+        raise UserError(f"{where} is no mapping: its keys are {', '.join(known)}.")
+    for key in content:
+        if key not in known:
+            raise unknown_name(f"key in {where},", str(key), known)
+    try:
+        return OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), content))
+    except OmegaConfBaseException as error:
+        told = str(error).splitlines()[0].rstrip(".")
+        raise UserError(f"{where} can't be read: {told}.") from error
+
+
+def experiment_jobs(overrides: Sequence[str]) -> list[list[str]]:
+    """The jobs that ``styleexp -m`` makes of these overrides, as lists of overrides."""
+    import hydra
+
+    from styleexp import compose
+
+    compose.register()
+    with hydra.initialize_config_module("styleexp.conf", version_base="1.3"):
+        return product(_params(overrides), overrides)
+
+
+def _params(overrides: Sequence[str]) -> Mapping[str, str]:
+    """The sweep that a configuration asks for by itself. Needs an initialised Hydra."""
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.types import RunMode
+
+    composed: Any = GlobalHydra.instance().hydra
+    config = composed.compose_config(
+        "config", list(overrides), run_mode=RunMode.MULTIRUN, from_shell=False
+    )
+    return dict(config.hydra.sweeper.params or {})
+
+
+def jobs(plan: Plan, folder: Path, overrides: Sequence[str] = ()) -> dict[str, list[Planned]]:
+    """The jobs of every experiment of a plan, by its name, in their order.
+
+    Jobs with the same key, be they of different experiments, share one folder and run once. Raises
+    `UserError`, and Hydra's exceptions, for what can't be composed.
+    """
+    import hydra
+
+    from styleexp import compose
+
+    compose.register()
+    found: dict[str, list[Planned]] = {}
+    first: dict[str, Planned] = {}
+    with hydra.initialize_config_module("styleexp.conf", version_base="1.3"):
+        for entry in plan.experiments:
+            assert entry.name is not None
+            listed = [each for part in _parts(plan, entry, overrides) for each in part]
+            made = []
+            for each, told in zip(listed, varying(listed), strict=True):
+                config = compose.typed(hydra.compose("config", [*each, "hydra.mode=RUN"]))
+                key = job_key(config)
+                name = f"{entry.name}/{_readable(told)}-{key[:8]}"
+                job = Planned(name, tuple(each), folder / name, key, entry.name)
+                shared = first.setdefault(key, job)
+                made.append(dataclasses.replace(job, name=shared.name, folder=shared.folder))
+            found[entry.name] = made
+    return found
+
+
+def _parts(plan: Plan, entry: Entry, overrides: Sequence[str]) -> Iterator[list[list[str]]]:
+    base = [f"+experiment={entry.experiment}"] if entry.experiment else []
+    base += [f"profile={plan.profile}", *plan.overrides, *entry.overrides, *overrides]
+    for pair in entry.pairs or [[]]:
+        chosen = [f"{k}={v}" for k, v in zip(("source", "style"), pair, strict=False)]
+        given = [*base, *chosen]
+        params = _params(given)
+        seeds = entry.seeds if entry.seeds is not None else plan.seeds
+        if seeds and (entry.seeds is not None or "optim.seed" not in params):
+            given.append(f"optim.seed={','.join(map(str, seeds))}")
+        yield product(params, given)
+
+
+def job_key(config: Config) -> str:
+    """Hash of what a run's result follows from: its resolved configuration, this version, and the
+    content of the files of its source and style."""
+    from styleexp import __version__, sources
+
+    files = {}
+    for kind, part in (("source", config.source), ("style", config.style)):
+        try:
+            path = sources.locate(kind, part.name, part.path)
+            files[kind] = _sha256(path) if path else None
+        except UserError:  # the run will say so
+            files[kind] = "not found"
+    content = {"config": essence(dataclasses.asdict(config)), "files": files, "by": __version__}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+@cache
+def _sha256(path: Path) -> str:
+    from styleexp import assets
+
+    return assets.sha256(path) if path.is_file() else "not found"
+
+
+def _readable(overrides: Mapping[str, str]) -> str:
+    """The overrides that tell a job from the others, as a file's name."""
+    words = [
+        v if "." not in k or k == "source.path" else f"{k.split('.')[-1]}{v}"
+        for k, v in overrides.items()
+    ]
+    return re.sub(r"[^\w.+-]+", "-", "_".join(words)).strip("-.")[:80] or "run"
+
+
+def quoted(value: str) -> str:
+    """A value that Hydra reads as this very string."""
+    if re.fullmatch(r"[\w/.-]+", value):
+        return value
+    return "'" + value.replace("\\", "\\\\").replace("'", "\\'") + "'"

@@ -1,0 +1,154 @@
+"""The end of a sweep: its table, its figure, and the exit code that tells whether all went well."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hydra.experimental.callback import Callback
+
+from styleexp.records import RunFolder
+from styleexp.reports import runs
+from styleexp.sweeps.jobs import Job, product, readable, varying
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+JOBS = "jobs.json"
+"""What was planned: so a job that never began is seen as missing."""
+
+begun: Path | None = None
+"""The folder of the sweep that this process began, if it did."""
+
+
+class OnSweep(Callback):
+    """Hydra's callback: note the jobs at the start of a sweep, report at its end."""
+
+    def on_multirun_start(self, config: DictConfig, **rest: Any) -> None:
+        """Write ``jobs.json`` for sweeps whose jobs are known beforehand."""
+        global begun
+        folder = Path(config.hydra.sweep.dir)
+        sweeper = config.hydra.sweeper
+        if "BasicSweeper" in sweeper._target_:
+            jobs = product(sweeper.params, list(config.hydra.overrides.task))
+            folder.mkdir(parents=True, exist_ok=True)
+            RunFolder(folder).write_json(JOBS, {"jobs": jobs})
+        begun = folder
+
+    def on_multirun_end(self, config: DictConfig, **rest: Any) -> None:
+        """Write and show what came out."""
+        finish(Path(config.hydra.sweep.dir))
+
+
+def planned(folder: Path) -> list[Job]:
+    """The jobs of Hydra's sweep in ``folder``, in order, with or without a folder of their own.
+
+    Where they weren't known beforehand (as with Optuna), those that were begun.
+    """
+    path = folder / JOBS
+    if path.exists():
+        listed = json.loads(path.read_text(encoding="utf-8"))["jobs"]
+        return [Job(str(n), tuple(each), folder / str(n)) for n, each in enumerate(listed)]
+    numbered = sorted((p for p in folder.glob("*") if p.name.isdigit()), key=lambda p: int(p.name))
+    return [Job(p.name, tuple(_overrides(p)), p) for p in numbered]
+
+
+def _overrides(folder: Path) -> list[str]:
+    try:
+        record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+        return list(record["overrides"])
+    except (OSError, ValueError, KeyError):
+        return []
+
+
+def exit_code(folder: Path) -> int:
+    """0 if every job of the sweep is done, else 2; by the jobs' own status, whoever ran them."""
+    states = {runs.read(job.folder)["status"] for job in planned(folder)}
+    return 0 if states == {"done"} else 2
+
+
+def finish(folder: Path, name: str | None = None) -> None:
+    """Table and figure of Hydra's sweep in ``folder``."""
+    report(planned(folder), folder, name or str(folder))
+
+
+def report(jobs: Sequence[Job], folder: Path, title: str) -> None:
+    """Write ``table.csv`` and ``figure.png`` into ``folder`` and show the table."""
+    from styleexp.sweeps.figure import write_figure
+
+    rows = table(jobs)
+    write_table(rows, folder)
+    write_figure(jobs, RunFolder(folder))
+    show(rows, title)
+    _print(f"{folder / 'figure.png'}, {folder / 'table.csv'}")
+
+
+def table(jobs: Sequence[Job]) -> list[dict[str, Any]]:
+    """A row for each job: ``job``, the overrides that tell it from the others (their keys begin
+    with ``=``), ``status``, ``seconds``, ``loss``, every metric by its name, and ``reason``."""
+    rows = []
+    for job, overrides in zip(jobs, varying([job.overrides for job in jobs]), strict=True):
+        run = runs.read(job.folder)
+        row: dict[str, Any] = {"job": job.name}
+        row |= {f"={key}": value for key, value in overrides.items()}
+        row |= {key: run[key] for key in ("status", "seconds", "loss")}
+        row |= {k.removeprefix("metric."): v for k, v in run.items() if k.startswith("metric.")}
+        row["reason"] = run["reason"]
+        rows.append(row)
+    return rows
+
+
+def write_table(rows: Sequence[dict[str, Any]], folder: Path) -> None:
+    """``table.csv``: a line for each job, a column for whatever any of them has."""
+    keys = [*dict.fromkeys(key for row in rows for key in row if key != "reason"), "reason"]
+
+    def write(path: Path) -> None:
+        with open(path, "w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(key.lstrip("=") for key in keys)
+            writer.writerows([row.get(key) for key in keys] for row in rows)
+
+    RunFolder(folder).write("table.csv", write)
+
+
+def show(rows: Sequence[dict[str, Any]], title: str) -> None:
+    """The table on the terminal."""
+    from rich.table import Table
+
+    shown = Table(title=title)
+    for column in ("job", "overrides", "status", "style distance", "loss", "time"):
+        shown.add_column(column, overflow="fold")
+    for row in rows:
+        overrides = {key[1:]: value for key, value in row.items() if key.startswith("=")}
+        status = str(row["status"])
+        seconds = row["seconds"]
+        shown.add_row(
+            str(row["job"]),
+            readable(overrides),
+            status if status == "done" else f"[red]{status}[/red]",
+            _number(row.get("style_distance")),
+            _number(row["loss"]),
+            f"{seconds:.0f} s" if isinstance(seconds, int | float) else "",
+        )
+    _print(shown)
+    for row in rows:
+        if row["reason"]:
+            _print(f"{row['job']}: {row['status']}: {row['reason']}")
+    if rows and not any("style_distance" in row for row in rows):
+        _print("style distance: not measured, no run has a metrics.json")
+
+
+def _number(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, int | float) else ""
+
+
+def _print(what: Any) -> None:
+    from rich.console import Console
+
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=120)  # a log has no width; keep the columns' names whole
+    console.print(what, soft_wrap=isinstance(what, str), markup=not isinstance(what, str))

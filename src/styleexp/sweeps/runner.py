@@ -1,0 +1,201 @@
+"""Runs a plan: whatever is not done yet, through one of Hydra's launchers, until nothing is left.
+
+A job is claimed by the lock of its own folder, which its process holds as long as it lives. So any
+number of runners may work on one plan, on one machine or on several that share its folder; a runner
+or a worker that is killed leaves a job that is resumed from its checkpoint.
+"""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from styleexp import locks, records
+from styleexp.errors import UserError
+from styleexp.reports import runs
+from styleexp.sweeps import launchers, manifest
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+    from styleexp.sweeps.plan import Planned
+
+LOG = "log.txt"
+"""In a job's folder: what it printed."""
+MOST_DEATHS = 3
+"""A job whose process died so often under this runner has failed."""
+POLL = 1.0
+"""Seconds between looks at jobs that other runners are at."""
+
+
+def run(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> None:
+    """Run what is neither done nor failed, and wait for what other runners are at.
+
+    ``launcher`` are overrides of Hydra's own configuration, ``launcher=...`` among them. Raises
+    `UserError` where the launcher itself fails without a job having begun.
+    """
+    deaths: Counter[str] = Counter()
+    while True:
+        states = {job.name: runs.read(job.folder)["status"] for job in jobs}
+        for job in jobs:
+            if states[job.name] == "died" and deaths[job.name] >= MOST_DEATHS:
+                _give_up(job, folder)
+                states[job.name] = "failed"
+        waiting = [job for job in jobs if states[job.name] not in (*manifest.ENDED, "running")]
+        if not waiting:
+            if "running" not in states.values():
+                return
+            time.sleep(POLL)
+            continue
+        before = _progress(folder, waiting)
+        error = _launch(waiting, folder, launcher)
+        deaths.update(j.name for j in waiting if runs.read(j.folder)["status"] == "died")
+        if error is None:
+            continue
+        if _progress(folder, waiting) == before:
+            raise UserError(
+                f"the launcher failed before any job began ({records.first_line(error)}): see "
+                f"{folder} or try --launcher basic."
+            ) from error
+        print(f"styleexp-sweep: a worker failed ({records.first_line(error)}); going on.")
+
+
+def retry(jobs: Sequence[Planned]) -> None:
+    """Let failed jobs run again, from their checkpoints where they have one."""
+    for job in jobs:
+        run_folder = records.RunFolder(job.folder)
+        try:
+            with locks.hold(job.folder):
+                if runs.status(job.folder) == "failed":
+                    run_folder.write_status("interrupted", reason="failed, to be tried again")
+        except locks.Busy:
+            continue
+
+
+def _give_up(job: Planned, folder: Path) -> None:
+    reason = f"its process died {MOST_DEATHS} times without finishing: see {LOG}"
+    with locks.hold(job.folder, manifest.PATIENCE):
+        records.RunFolder(job.folder).write_status("failed", reason=reason)
+    manifest.update(folder, job.name, "failed")
+    print(f"{job.name}: failed: {reason}")
+
+
+def _progress(folder: Path, jobs: Sequence[Planned]) -> list[Any]:
+    known = manifest.read(folder)
+    return [known.get(job.name, {}).get("attempts") for job in jobs]
+
+
+def _launch(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> Exception | None:
+    """Give the jobs to Hydra's launcher; returns what it raised or a job's process died of."""
+    import hydra
+    from hydra._internal.callbacks import Callbacks
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.plugins import Plugins
+    from hydra.core.utils import JobStatus
+    from hydra.types import HydraContext, RunMode
+
+    from styleexp.sweeps.plan import quoted
+
+    with hydra.initialize_config_module("styleexp.conf", version_base="1.3"):
+        composed: Any = GlobalHydra.instance().hydra
+        config = composed.compose_config(
+            "config",
+            [f"hydra.sweep.dir={quoted(str(folder))}", *launcher],
+            run_mode=RunMode.MULTIRUN,
+            from_shell=False,
+        )
+        started = Plugins.instance().instantiate_launcher(
+            hydra_context=HydraContext(composed.config_loader, Callbacks()),
+            task_function=task,
+            config=config,
+        )
+        threads = launchers.threads_each(config.hydra)
+        # Hydra composes every job with the launcher's own overrides: they need the launcher, too.
+        chosen = [each for each in launcher if each.startswith("launcher=")]
+        given = []
+        for job in jobs:
+            more = [*chosen, f"hydra.sweep.subdir={job.name}"]
+            if not any(each.startswith("threads=") for each in job.overrides):
+                more.append(f"threads={threads}")
+            given.append([*job.overrides, *more])
+        size = launchers.batch_size(config.hydra) or len(jobs)
+        for at in range(0, len(jobs), size):
+            try:
+                returned = started.launch(given[at : at + size], initial_job_idx=at)
+            except Exception as error:
+                _settle(jobs[at : at + size])
+                return error
+            for each in returned:
+                if each.status == JobStatus.FAILED:
+                    return each._return_value
+    return None
+
+
+def _settle(jobs: Sequence[Planned]) -> None:
+    """Wait for the jobs that go on although another of them was killed."""
+    while any(runs.read(job.folder)["status"] == "running" for job in jobs):
+        time.sleep(POLL)
+
+
+def task(config: DictConfig) -> None:
+    """What the launcher calls for a job, maybe in another process.
+
+    Skips what another runner does or did in the meantime. Never raises for the job's own failure.
+    """
+    from hydra.core.hydra_config import HydraConfig
+
+    from styleexp import compose
+
+    runtime = HydraConfig.get()
+    root, folder = Path(runtime.sweep.dir), Path(runtime.runtime.output_dir)
+    name = str(runtime.sweep.subdir)
+    compose.register()
+    try:
+        with locks.hold(folder):
+            if runs.status(folder) not in manifest.ENDED:
+                _work(config, root, folder, name, list(runtime.overrides.task))
+    except locks.Busy:
+        return
+
+
+def _work(config: DictConfig, root: Path, folder: Path, name: str, overrides: list[str]) -> None:
+    """Do a job whose lock is held; what it prints goes into its log."""
+    from styleexp import compose
+    from styleexp.cli.run import begin
+
+    begun = time.perf_counter()
+    manifest.update(root, name, "running")
+    code = 0
+    with (
+        open(folder / LOG, "a", buffering=1, encoding="utf-8") as log,
+        redirect_stdout(log),
+        redirect_stderr(log),
+    ):
+        try:
+            told = [each for each in overrides if not each.startswith("launcher=")]
+            code = begin(compose.typed(config), folder, [*told, "hydra.mode=RUN"])
+        except UserError as error:
+            _failed(folder, str(error))
+            print(f"styleexp: {error}")
+        except Exception as error:
+            _failed(folder, records.first_line(error))
+            traceback.print_exc()
+    state = str(runs.status(folder))
+    listed = manifest.update(root, name, state)
+    done = sum(job["state"] == "done" for job in listed.values())
+    current = sum(job["state"] != "outdated" for job in listed.values())
+    took = time.perf_counter() - begun
+    print(f"{name}: {state} in {took:.0f} s ({done} of {current} done)", flush=True)
+    if code == 130:
+        raise KeyboardInterrupt
+
+
+def _failed(folder: Path, reason: str) -> None:
+    """Leave a status where the run could not even begin one."""
+    if runs.status(folder) != "failed":
+        records.RunFolder(folder).write_status("failed", reason=reason)

@@ -1,0 +1,194 @@
+"""Every experiment: a delta that says what it is for, and runs; its table and its figure."""
+
+import csv
+import json
+import os
+import re
+import subprocess
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+from PIL import Image
+
+from styleexp import assets, config
+from styleexp.compose import compose
+from styleexp.sweeps import report
+from styleexp.sweeps.figure import Shown, layout
+from styleexp.sweeps.jobs import Job, setting, varying
+from styleexp.sweeps.plan import experiment_jobs
+
+CONF = Path(__file__).parent.parent / "conf"
+EXPERIMENTS = sorted((CONF / "experiment").glob("*.yaml"))
+GIVEN = ("source=torus", "style=bubble")
+"""What an experiment may leave to be chosen, chosen."""
+
+each_experiment = pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: path.stem)
+
+
+def styleexp(*arguments, cwd, **environment):
+    return subprocess.run(
+        [sys.executable, "-m", "styleexp", *arguments],
+        cwd=cwd,
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def flat(tree, prefix=""):
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from flat(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value
+
+
+@each_experiment
+def test_experiment_names_its_figure_its_command_and_its_time(path):
+    head = path.read_text().split("\n\n")[0]
+    assert re.search(r"\((.*; )?(Figs?\. \d|.*no figure)|Figs?\. \d", head)
+    assert f"styleexp +experiment={path.stem}" in head
+    assert re.search(r"fast \d+ minutes?, standard|fast \d+ minutes?; standard", head)
+
+
+@each_experiment
+def test_experiment_is_a_delta(path):
+    """It chooses among options, sweeps, and repeats no default."""
+    body = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
+    defaults = body.pop("defaults", [])
+    assert all(next(iter(entry)).startswith("override /") for entry in defaults)
+    hydra = body.pop("hydra")
+    assert hydra["mode"] == "MULTIRUN"
+    assert hydra["sweeper"]["params"]
+    default = dict(flat(asdict(compose(GIVEN))))
+    assert not [key for key, value in flat(body) if default.get(key) == value]
+    assert len(path.read_text().splitlines()) < 30
+
+
+@each_experiment
+def test_every_job_of_every_experiment_is_valid(path):
+    jobs = experiment_jobs([f"+experiment={path.stem}"])
+    assert len(jobs) > 1
+    for overrides in jobs:
+        config.check(compose([*overrides, "hydra.mode=RUN"]))
+
+
+@each_experiment
+def test_experiment_runs(path, tmp_path):
+    """The ends of each of its axes, at ``profile=smoke``."""
+    params = OmegaConf.load(path).hydra.sweeper.params
+    arguments = []
+    for key, values in params.items():
+        names = [name.strip() for name in values.split(",")]
+        arguments.append(f"{key}={names[0]},{names[-1]}")
+    for overrides in experiment_jobs([f"+experiment={path.stem}", *arguments]):
+        chosen = compose([*overrides, "hydra.mode=RUN"])
+        for name in (chosen.source.name, chosen.style.name):
+            for kind in ("mesh", "image"):
+                if name in assets.names(kind) and assets.locate(name, kind) is None:
+                    pytest.skip(f"the {kind} '{name}' is in no folder of STYLEEXP_ASSETS")
+    arguments += ["profile=smoke", "encoder=vgg19_random", "hydra.sweep.dir=all"]
+    done = styleexp(f"+experiment={path.stem}", *arguments, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    jobs = report.planned(tmp_path / "all")
+    assert len(jobs) == 2 ** len(params)
+    for job in jobs:
+        assert json.loads((job.folder / "status.json").read_text())["status"] == "done"
+    assert (tmp_path / "all" / "figure.png").exists()
+
+
+def test_every_switch_between_the_methods_has_its_file():
+    """method_ablation covers each key in which ``paper`` differs from ``robust``."""
+    paper, robust = (
+        dict(flat(asdict(compose([*GIVEN, f"method={name}"])))) for name in ("paper", "robust")
+    )
+    differing = {key for key in paper if paper[key] != robust[key]}
+    flipped = {
+        key
+        for path in (CONF / "switch").glob("*.yaml")
+        for key, value in flat(OmegaConf.to_container(OmegaConf.load(path)))
+        if key != "defaults" and paper[key] == value
+    }
+    sizes = {"views.local.per_view"}  # the profile's
+    assert differing - sizes <= flipped
+    swept = OmegaConf.load(CONF / "experiment" / "method_ablation.yaml").hydra.sweeper.params
+    names = {name.strip() for name in swept["+switch"].split(",")}
+    files = {path.stem for path in (CONF / "switch").glob("*.yaml")}
+    assert names == files - {"image_tone"}
+
+
+def test_a_failed_job_under_joblib_fails_the_sweep_and_is_in_the_table(tmp_path):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="needs the extra sweep")
+    done = styleexp(
+        "-m", "source=torus", "style=bubble", "style.path=null,none.obj", "launcher=joblib",
+        "profile=smoke", "encoder=vgg19_random", "hydra.sweep.dir=all", cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert "none.obj" in done.stdout
+    with open(tmp_path / "all" / "table.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["status"] for row in rows] == ["done", "failed"]
+    assert [row["style.path"] for row in rows] == ["null", "none.obj"]
+    assert "none.obj" in rows[1]["reason"]
+    assert float(rows[0]["seconds"]) > 0
+    assert Image.open(tmp_path / "all" / "figure.png").width > 96
+    threads = json.loads((tmp_path / "all" / "0" / "run.json").read_text())["threads"]
+    assert threads == max(1, len(os.sched_getaffinity(0)) // 2)
+
+
+def test_a_job_that_never_began_is_missing_and_fails_the_sweep(tmp_path):
+    (tmp_path / "jobs.json").write_text(json.dumps({"jobs": [["style=bubble"], ["style=rail"]]}))
+    (tmp_path / "0").mkdir()
+    (tmp_path / "0" / "status.json").write_text('{"status": "done", "seconds": 3.0}')
+    assert report.exit_code(tmp_path) == 2
+    rows = report.table(report.planned(tmp_path))
+    assert [row["status"] for row in rows] == ["done", "missing"]
+    assert [row["=style"] for row in rows] == ["bubble", "rail"]
+
+
+def kinds(lines):
+    return [[cell and (cell.kind, cell.job) for cell in line] for line in lines]
+
+
+def test_settings_are_columns():
+    shown = [Shown("spot", "bubble", name) for name in ("low", "mixed", "high", "a", "b")]
+    assert kinds(layout(shown)) == [
+        [("source", 0), ("style", 0), *(("result", n) for n in range(4))],
+        [None, None, ("result", 4)],
+    ]
+    assert layout(shown)[0][3].caption == "mixed"
+
+
+def test_products_of_sources_and_styles_are_a_grid():
+    shown = [Shown(source, style, "") for source in ("spot", "fish") for style in ("rail", "wave")]
+    assert kinds(layout(shown)) == [
+        [None, ("style", 0), ("style", 1)],
+        [("source", 0), ("result", 0), ("result", 1)],
+        [("source", 2), ("result", 2), ("result", 3)],
+    ]
+
+
+def test_pairs_are_triples():
+    shown = [Shown("spot", "rail", ""), Shown("fish", "wave", ""), Shown("cat", "rail", "")]
+    triple = [[("source", n), ("style", n), ("result", n)] for n in range(3)]
+    assert kinds(layout(shown)) == [triple[0] + triple[1], triple[2]]
+
+
+def test_labels_name_what_differs():
+    told = varying([["layers=low", "field.sigma=1", "+experiment=x"],
+                    ["layers=high", "field.sigma=1", "+experiment=x"]])  # fmt: skip
+    assert told == [{"layers": "low"}, {"layers": "high"}]
+    assert setting({"layers": "low", "field.sigma": "1", "source": "x"}) == "low, field.sigma=1"
+
+
+def test_jobs_without_a_folder_are_drawn_as_missing(tmp_path):
+    jobs = [Job(name, (*GIVEN, f"optim.seed={name}", "preview.resolution=96"), tmp_path / name)
+            for name in "01"]  # fmt: skip
+    report.report(jobs, tmp_path, "two that never began")
+    picture = Image.open(tmp_path / "figure.png")
+    assert picture.width == 4 * 96
+    assert min(picture.crop((2 * 96, 20, 4 * 96, 112)).tobytes()) < 128  # words
