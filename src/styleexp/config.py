@@ -217,6 +217,17 @@ class PreviewConfig:
 
 
 @dataclass
+class MetricsConfig:
+    """How the result is measured, in metrics.json; never seen by the optimisation."""
+
+    judge: str = "auto"
+    """The encoder that judges how near the style is: ``auto`` is one that the run doesn't train
+    with; ``none`` leaves out what needs an encoder."""
+    windows: int = 32
+    """Places of the result that are looked at."""
+
+
+@dataclass
 class Config:
     """One run."""
 
@@ -234,6 +245,7 @@ class Config:
     options, with its registered ``name``; ``conf/method`` sets it."""
     optim: OptimConfig = option(default_factory=OptimConfig)
     preview: PreviewConfig = option(default_factory=PreviewConfig)
+    metrics: MetricsConfig = option(default_factory=MetricsConfig)
     report: bool = True
     """Write ``report.html``, the run's page: about 3 MB and a second for 20 000 faces."""
     strength: float = 1.0
@@ -279,6 +291,7 @@ POSITIVE = (
     "optim.decay_every",
     "optim.checkpoint_every",
     "preview.turntable_frames",
+    "metrics.windows",
 )
 
 BETWEEN = {

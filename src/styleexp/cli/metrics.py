@@ -89,11 +89,11 @@ JUDGE_HELP = "encoder that judges, none for metrics without one (an encoder the 
 
 
 def _judge(options: argparse.Namespace, trained: str | None = None) -> Judge | None:
-    from styleexp.metrics import choose_judge
+    from styleexp.metrics import judge_name, load_judge
 
     if options.windows < 1:
         raise UserError(f"--windows {options.windows}: give 1 or more.")
-    return choose_judge(options.judge, trained, options.windows)
+    return load_judge(judge_name(options.judge, trained), options.windows)
 
 
 def _run(options: argparse.Namespace) -> dict[str, Any]:

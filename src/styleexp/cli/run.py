@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from styleexp.stylize import Result, State, Step
 
 
+SHOWN_METRICS = ("style_distance", "silhouette_iou", "flipped_faces", "spike")
+"""What is printed of metrics.json."""
 LOCK_PATIENCE = 2.0
 """Seconds to wait for a folder: who only looks whether it is held, holds it for a moment."""
 
@@ -148,7 +150,7 @@ def _fail(folder: records.RunFolder, reason: str) -> None:
 def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resumed: bool) -> int:
     import torch
 
-    from styleexp import baselines, sources
+    from styleexp import assets, baselines, metrics, sources
     from styleexp.config import check
     from styleexp.scene import Scene
 
@@ -159,6 +161,9 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
         from styleexp.previews import check_available
 
         check_available(config.preview.platform)
+    judge = metrics.judge_name(config.metrics.judge, config.encoder.name)
+    if judge in assets.names("weights"):
+        assets.find(judge, "weights")  # if it can't be had, say so before the run, not after
     method = baselines.method(config)
     scene = method.prepare(config)
     for note in scene.notes:
@@ -176,6 +181,7 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
         "chosen": {"sigma": scene.sigma, "bound": scene.bound, "relief": scene.relief},
         "assets": sources.describe(config),
         "notes": list(scene.notes),
+        "judge": judge,
     }
     if isinstance(scene, Scene):
         record["encoder_precision"] = scene.loss.encoder.precision
@@ -221,9 +227,23 @@ def _write_results(result: Result, folder: records.RunFolder) -> list[Path]:
     folder.write("turntable.gif", lambda path: previews.write_turntable(result, path))
     names = ("preview.png", "turntable.gif", "result.glb", "result.ply", "result.obj")
     written = [folder.path / name for name in names]
-    if result.scene.config.preview.name == "pyrender":
+    config = result.scene.config
+    found = _measure(result, config)
+    folder.write_json("metrics.json", found)
+    print("  ".join(f"{name} {found[name]:.3g}" for name in SHOWN_METRICS if name in found))
+    if config.preview.name == "pyrender":
         written += previews.write_check(result, folder.write)
     return written
+
+
+def _measure(result: Result, config: Config) -> dict[str, float]:
+    """The metrics, against the result's own source: a baseline may have divided its faces."""
+    from styleexp import metrics
+
+    name = metrics.judge_name(config.metrics.judge, config.encoder.name)
+    judge = metrics.load_judge(name, config.metrics.windows)
+    source, style = result.scene.source, result.scene.style
+    return metrics.measure(config, source, style, result.vertices, source.faces, judge)
 
 
 @contextmanager

@@ -55,18 +55,18 @@ class Judge:
         return self.styles[key]
 
 
-def choose_judge(name: str, trained: str | None, windows: int) -> Judge | None:
-    """The judge of that name. Downloads its weights where they aren't here yet.
+def judge_name(name: str, trained: str | None) -> str | None:
+    """``auto`` is an encoder that the run was not ``trained`` with; ``none`` is None."""
+    if name == "auto":
+        return "vgg16" if trained == "vgg16_edges" else "vgg16_edges"
+    return None if name == "none" else name
 
-    ``auto`` is an encoder that the run was not ``trained`` with; ``none`` is None.
-    """
+
+def load_judge(name: str | None, windows: int) -> Judge | None:
+    """The judge of that name. Downloads its weights where they aren't here yet."""
     from styleexp.encoders import load_encoder
 
-    if name == "none":
-        return None
-    if name == "auto":
-        name = "vgg16" if trained == "vgg16_edges" else "vgg16_edges"
-    return Judge(name, load_encoder(name), windows)
+    return None if name is None else Judge(name, load_encoder(name), windows)
 
 
 def measure(
