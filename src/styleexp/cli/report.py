@@ -36,6 +36,13 @@ def report(given: list[str]) -> list[Path]:
     options = _parser().parse_args(given)
     if not options.folder.is_dir():
         raise UserError(f"there is no folder '{options.folder}': give a run's or a sweep's.")
+    if options.notebooks is not None:
+        from styleexp.reports import notebooks
+
+        pages, left_out = notebooks.execute(options.folder, options.notebooks)
+        for told in left_out:
+            print(f"styleexp-report: {told}", file=sys.stderr)
+        return pages
     from styleexp.reports import folders, page, sweep_page
 
     if folders.is_run(options.folder):
@@ -95,6 +102,13 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="of a run, a sweep, or several")
+    parser.add_argument(
+        "--notebooks",
+        nargs="*",
+        metavar="NAME",
+        help="execute the notebooks of the paper's figures that have runs here, or those named, "
+        "to FOLDER/notebooks",
+    )
     parser.add_argument("--open", action="store_true", help="open the page in the browser")
     parser.add_argument(
         "--no-run-pages",
