@@ -54,7 +54,7 @@ def spread(metric):
 nb.claims(
     *(
         nb.smaller(
-            "(not in the paper) the renderer matters less than the seed",
+            f"(not in the paper) the renderer matters less than the seed for {metric}",
             ("spread of renderers", spread(metric)[0]), ("spread of seeds", spread(metric)[1]), metric,
         )
         for metric in ("style_distance", "relief_rms", "silhouette_iou")

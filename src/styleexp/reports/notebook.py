@@ -20,6 +20,7 @@ from styleexp.reports.shown import read_result
 
 if TYPE_CHECKING:
     import pandas
+    from IPython.display import HTML
     from IPython.display import Image as Shown
     from matplotlib.figure import Figure
 
@@ -215,12 +216,15 @@ def smaller(paper: str, first: tuple[str, float], second: tuple[str, float], wha
     return Claim(paper, ours, first[1] < second[1])
 
 
-def claims(*each: Claim) -> pandas.DataFrame:
+def claims(*each: Claim) -> HTML:
     """The claims as a table to show."""
     import pandas
+    from IPython.display import HTML
 
     rows = [(c.paper, c.ours, VERDICTS[c.holds]) for c in each]
-    return pandas.DataFrame(rows, columns=["the paper says", "we see", "does it hold"])
+    frame = pandas.DataFrame(rows, columns=["the paper says", "we see", "does it hold"])
+    with pandas.option_context("display.max_colwidth", None):  # else pandas cuts sentences off
+        return HTML(frame.to_html(index=False, border=0))
 
 
 def table(frame: pandas.DataFrame, metrics: Sequence[str] = ()) -> pandas.DataFrame:

@@ -98,18 +98,19 @@ def _kernel() -> Any:
 
 
 def as_page(notebook: Path) -> str:
-    """An executed notebook as a page of ours: one file, no script from anywhere."""
+    """What an executed notebook says and shows, without its code, as a page of ours: one file, no
+    script from anywhere."""
     import nbformat
     from markupsafe import Markup
     from nbconvert import HTMLExporter
-    from pygments.formatters import HtmlFormatter
 
     content = nbformat.read(notebook, as_version=4)
-    body, _ = HTMLExporter(template_name="basic", embed_images=True).from_notebook_node(content)
+    exporter = HTMLExporter(template_name="basic", embed_images=True, exclude_input=True)
+    body, _ = exporter.from_notebook_node(content)
     return html.render(
         "notebook.html",
         [],
         title=notebook.stem.replace("_", " "),
         body=Markup(body),
-        highlighting=Markup(HtmlFormatter(style="default").get_style_defs(".highlight")),
+        notebook=notebook.name,
     )
