@@ -44,9 +44,8 @@ for name, part in runs.groupby("experiment", sort=False):
     table = by.mean(numeric_only=True)
     table.insert(0, "runs", by.size())
     if by.size().max() > 1:
-        table["std of loss"] = (
-            by.std(numeric_only=True)["loss"] if "loss" in measured else float("nan")
-        )
+        judged = "metric.style_distance" if "metric.style_distance" in measured else measured[0]
+        table[f"std of {judged.removeprefix('metric.')}"] = by[judged].std()
     table = table.reset_index()
     table.columns = [str(c).removeprefix("metric.").removeprefix("axis.") for c in table.columns]
     nb.save(table, tables, f"appendix_{name}")

@@ -21,6 +21,20 @@ NAME = "report.html"
 STYLE_PIXELS = 720
 """A style picture's longer side on the page."""
 STILL_PIXELS = 1280
+MEANINGS = {
+    "style_distance": "to the style, by an encoder that was not trained with; 0 the style, 1 none",
+    "relief_distance": "to the style mesh's relief, without a neural network; 0 is equal",
+    "relief_rms": "root mean square height of the relief, in radii of the source",
+    "relief_share": "that height over the style mesh's own",
+    "silhouette_iou": "overlap of the silhouettes with the source's; 1 is equal",
+    "chamfer": "mean distance to the source's surface, over its diagonal",
+    "hausdorff": "largest distance to the source's surface, over its diagonal",
+    "volume_change": "of the source's volume",
+    "flipped_faces": "share of the faces that point the other way now",
+    "self_intersections": "share of the faces that cut another one",
+    "spike": "farthest displacements over the root mean square; large where few stick out",
+}
+"""What the metrics of `styleexp.metrics` mean, in short."""
 FILES = (
     ("result.glb", "the result, for viewers and engines"),
     ("result.ply", "with the displacement as a vertex attribute"),
@@ -74,6 +88,7 @@ def build(run: Run, shown: Shown) -> str:
         warnings=[*run.record.get("notes", ()), *run.problems, *shown.missing],
         assets=_assets(run),
         still=html.picture(run.folder / "preview.png", STILL_PIXELS),
+        meanings=MEANINGS,
         files=[(name, what) for name, what in FILES if (run.folder / name).is_file()],
         overridden={override.lstrip("+~").split("=")[0] for override in run.overrides},
         plain=html.plain,
@@ -83,6 +98,9 @@ def build(run: Run, shown: Shown) -> str:
 def facts(run: Run, shown: Shown) -> list[tuple[str, str]]:
     """The few numbers that a reader wants first."""
     found = [("status", run.state)]
+    baseline = run.config.get("baseline.name")
+    if baseline:
+        found.append(("method", f"{baseline} (a baseline)"))
     if run.seconds is not None:
         found.append(("time", html.duration(run.seconds)))
     if run.steps:
