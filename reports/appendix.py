@@ -40,8 +40,8 @@ for name, part in runs.groupby("experiment", sort=False):
     measured = [c for c in ["loss", *metrics] if c in part and part[c].notna().any()]
     if not measured:
         continue
-    by = part.groupby(axes or ["pair"], dropna=False, sort=False)[measured]
-    table = by.mean(numeric_only=True)
+    by = part.groupby(axes or ["pair"], dropna=False, sort=False)
+    table = by[measured].mean()
     table.insert(0, "runs", by.size())
     if by.size().max() > 1:
         judged = "metric.style_distance" if "metric.style_distance" in measured else measured[0]

@@ -47,7 +47,7 @@ if study is None:
 elif study["simulated_participants"]:
     shown = Markdown(
         f"**{study['simulated_participants']} of {study['participants']} participants are simulated: "
-        "these are random numbers.**"
+        "a program gave these ratings.**"
     )
 else:
     shown = Markdown(f"{study['participants']} participants.")

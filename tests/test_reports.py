@@ -294,6 +294,24 @@ def test_grid_has_failed_and_missing_cells_and_seeds_share_one(sweep):
     assert "style_distance by layers" in text
 
 
+def test_pictures_are_the_previews_own_views(tmp_path):
+    from PIL import Image
+
+    from styleexp import previews
+
+    shades = [
+        [Image.new("L", (96, 96), 60 * row + 10 * view) for view in range(4)] for row in (0, 1, 2)
+    ]
+    sheet = previews.sheet([("source", shades[0]), ("style", shades[1]), ("result", shades[2])], 96)
+    sheet.save(tmp_path / "preview.png")
+    for row in (0, 1, 2):
+        seen = [np.unique(np.asarray(view)).tolist() for view in html.views(tmp_path, row)]
+        assert seen == [[60 * row + 10 * view] for view in range(4)]
+    sheet.resize((100, 100)).save(tmp_path / "preview.png")
+    assert html.views(tmp_path, 2) == []
+    assert html.views(tmp_path / "nowhere", 2) == []
+
+
 def test_axes_are_sorted_as_numbers_and_a_third_makes_sheets():
     def run(number, *given):
         return folders.Run(folders.Path(f"s/{number}"), overrides=list(given))

@@ -91,6 +91,26 @@ def picture(path: Path, longest: int) -> str | None:
         return None
 
 
+def views(folder: Path, row: int) -> list[Image.Image]:
+    """The four views in a row of a run's ``preview.png``: 0 the source, 1 the style, 2 the result.
+
+    Empty where there is no such picture or it is laid out in another way.
+    """
+    from PIL import Image
+
+    try:
+        with Image.open(folder / "preview.png") as opened:
+            sheet = opened.convert("L")
+    except OSError:
+        return []
+    size = sheet.width // 4
+    band = max(18, size // 12)  # as `previews.sheet` does it
+    if sheet.height != 3 * (size + band):
+        return []
+    top = row * (size + band) + band
+    return [sheet.crop((k * size, top, (k + 1) * size, top + size)) for k in range(4)]
+
+
 def save(path: Path, text: str) -> Path:
     """Write a page whole or not at all."""
     from styleexp.records import RunFolder

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from styleexp.errors import UserError
-from styleexp.reports import folders, sweep_page
+from styleexp.reports import folders, html, sweep_page
 from styleexp.reports.collect import collect
 from styleexp.reports.shown import read_result
 
@@ -87,7 +87,6 @@ def pictures(frame: pandas.DataFrame, columns: str, rows: str = "pair") -> Shown
     Each row begins with its source. What did not finish is a cell that says so.
     """
     from matplotlib.figure import Figure
-    from PIL import Image
 
     across, down = _order(frame[columns]), _order(frame[rows])
     figure = Figure(figsize=(1.9 * (len(across) + 1), 2.05 * len(down) + 0.2), layout="constrained")
@@ -103,31 +102,24 @@ def pictures(frame: pandas.DataFrame, columns: str, rows: str = "pair") -> Shown
             if cell.empty:
                 continue
             first = cell.iloc[0]
-            path = Path(first["path"]) / "turntable.gif"
-            if first["status"] != "done" or not path.is_file():
+            seen = html.views(Path(first["path"]), 2)
+            if first["status"] != "done" or not seen:
                 axis.text(0.5, 0.5, first["status"], ha="center", color="#a3262b")
                 axis.set(xlim=(0, 1), ylim=(0, 1))
                 continue
-            with Image.open(path) as picture:
-                axis.imshow(np.asarray(picture.convert("RGB")))
+            axis.imshow(seen[0], cmap="gray", vmin=0, vmax=255)
         _show_row_head(axes[y, 0], line, str(row))
     return _picture(figure)
 
 
 def _show_row_head(axis: Any, line: pandas.DataFrame, label: str) -> None:
-    """The row's label, and its source and style out of a preview's rows."""
-    from PIL import Image
-
+    """The row's label, and its source and style out of a preview."""
     axis.set_title(label, fontsize=9)
     for path in line["path"]:
-        file = Path(path) / "preview.png"
-        if file.is_file():
-            with Image.open(file) as opened:
-                sheet = np.asarray(opened.convert("RGB"))
-            size = sheet.shape[1] // 4  # as `previews.sheet` lays out four views in a row
-            band = max(18, size // 12)
-            source, style = (sheet[band + k * (size + band) :][:size, :size] for k in (0, 1))
-            axis.imshow(np.concatenate([source, style], axis=1))
+        seen = [html.views(Path(path), row) for row in (0, 1)]
+        if all(seen):
+            pair = np.concatenate([np.asarray(row[0]) for row in seen], axis=1)
+            axis.imshow(pair, cmap="gray", vmin=0, vmax=255)
             return
 
 

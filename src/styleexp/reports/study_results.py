@@ -181,7 +181,7 @@ def draw(rows: Sequence[dict[str, Any]], found: dict[str, Any], path: Path) -> N
     axes.set_axisbelow(True)
     axes.set_ylabel("mean rating")
     alpha = found["krippendorff_alpha_ordinal"]
-    agreement = "undefined" if alpha is None else f"{alpha:.2f}"
+    agreement = "undefined" if alpha is None else f"{round(alpha, 2) + 0.0:.2f}"
     title = (
         f"{found['participants']} participants, bars: mean, whiskers: 95 % confidence (t)\n"
         f"Krippendorff's alpha (ordinal): {agreement}"
@@ -189,7 +189,7 @@ def draw(rows: Sequence[dict[str, Any]], found: dict[str, Any], path: Path) -> N
     if found["simulated_participants"]:
         title += (
             f"\nSIMULATED: {found['simulated_participants']} of {found['participants']} "
-            "participants are random numbers, not people"
+            "participants are a program, not people"
         )
     axes.set_title(title, fontsize=9, color="#a3262b" if found["simulated_participants"] else None)
     figure.savefig(path, dpi=130)

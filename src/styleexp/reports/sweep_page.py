@@ -123,6 +123,7 @@ def build(folder: Path, runs: list[Run]) -> str:
         sweeps=sweeps,
         states=_count(runs),
         pictures={run.folder: _picture(run) for run in runs},
+        headlines={run.folder: headline(run) for run in runs},
         links={run.folder: _link(run, folder) for run in runs},
         measures={sweep.name: measures(sweep) for sweep in sweeps},
         plots={sweep.name: plots(sweep) for sweep in sweeps},
@@ -160,9 +161,18 @@ def settings(run: Run) -> dict[str, str]:
     return {key: value for key, _, value in pairs if not key.startswith("hydra")}
 
 
+def headline(run: Run) -> tuple[str, float] | None:
+    """The number that is shown below a run's picture: what says most about its result."""
+    for name in ("style_distance", "loss"):
+        if name in run.summary:
+            return name, run.summary[name]
+    return None
+
+
 def measures(sweep: Sweep) -> list[str]:
     """Names of all numbers that some run of the sweep has."""
-    return list(dict.fromkeys(name for run in sweep.runs for name in run.summary))
+    first = [told[0] for run in sweep.runs if (told := headline(run))]
+    return list(dict.fromkeys([*first, *(name for run in sweep.runs for name in run.summary)]))
 
 
 def plots(sweep: Sweep) -> list[dict[str, Any]]:
@@ -188,11 +198,8 @@ def plots(sweep: Sweep) -> list[dict[str, Any]]:
 
 
 def _picture(run: Run) -> str | None:
-    for name in ("turntable.gif", "preview.png"):
-        found = html.picture(run.folder / name, html.THUMBNAIL)
-        if found:
-            return found
-    return None
+    seen = html.views(run.folder, 2) if run.state == "done" else []
+    return html.data_uri(seen[0], html.THUMBNAIL) if seen else None
 
 
 def _link(run: Run, folder: Path) -> str | None:
