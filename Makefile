@@ -2,6 +2,8 @@
 # make test   set up .venv, run every test
 # make lint   ruff and mypy
 # make conformance   write docs/conformance.md from the checks of every renderer
+# make stress   kill runners and workers of sweeps ten times each, with every local launcher
+# make ray-test   a sweep on a local Ray cluster, in an environment of its own (.venv-ray)
 # Override: PYTHON (which interpreter), CONSTRAINTS (pinned versions; empty for none), PIP_FLAGS.
 
 PYTHON ?= python3
@@ -16,7 +18,7 @@ export OMP_WAIT_POLICY ?= PASSIVE
 # Named meshes and images, where there are some beside the checkout.
 export STYLEEXP_ASSETS ?= $(wildcard $(abspath ../shared))
 
-.PHONY: demo test lint conformance clean
+.PHONY: demo test lint conformance stress ray-test clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -34,8 +36,19 @@ lint: $(VENV)/.installed-dev
 conformance: $(VENV)/.installed-dev
 	$(BIN)/python -m styleexp.testing > docs/conformance.md
 
+stress: $(VENV)/.installed-dev
+	STYLEEXP_KILLS=10 OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/test_sweeps.py -k kill_9
+
+# The Ray launcher pins cloudpickle below the tested version.
+ray-test: pyproject.toml constraints.txt
+	test -x $(VENV)-ray/bin/python || $(PYTHON) -m venv $(VENV)-ray
+	grep -v -i '^cloudpickle==' constraints.txt > $(VENV)-ray/constraints.txt
+	$(VENV)-ray/bin/python -m pip install --quiet --disable-pip-version-check \
+		--constraint $(VENV)-ray/constraints.txt $(PIP_FLAGS) --editable '.[ray]' pytest
+	OMP_NUM_THREADS=1 $(VENV)-ray/bin/python -m pytest tests/test_ray.py
+
 clean:
-	rm -rf $(VENV) build dist src/*.egg-info
+	rm -rf $(VENV) $(VENV)-ray build dist src/*.egg-info
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

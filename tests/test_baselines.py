@@ -23,8 +23,8 @@ from styleexp.errors import UserError
 from styleexp.fields import VertexField
 
 SMOKE = ("profile=smoke", "encoder=vgg19_random")
-FOLDER = {"run.json", "status.json", "preview.png", "turntable.gif", "result.ply", "result.obj",
-          "result.glb"}  # fmt: skip
+FOLDER = {"run.json", "status.json", "metrics.json", "preview.png", "turntable.gif", "result.ply",
+          "result.obj", "result.glb"}  # fmt: skip
 STEPPED = {"metrics.jsonl", "checkpoint.safetensors"}
 pytestmark = pytest.mark.filterwarnings("ignore:the encoder 'vgg19_random'")
 
@@ -52,6 +52,13 @@ def test_without_a_baseline_the_method_is_the_papers():
     assert baselines.method(compose(["source=torus", "style=bubble"])) is sys.modules[
         "styleexp.stylize"
     ]  # fmt: skip
+
+
+def test_a_baseline_from_python(tmp_path):
+    result = styleexp.stylize("sphere", "stripe", "method=displacement_map", "strength=0.5")
+    assert np.ptp(result.displacement) == pytest.approx(0.06 * 0.5, rel=0.2)  # the bands are 0.06
+    result.save(tmp_path / "out.ply")
+    assert len(styleexp.load_mesh(tmp_path / "out.ply").vertices) == len(result.vertices)
 
 
 PLUGIN = """
@@ -94,7 +101,9 @@ def test_a_baseline_of_a_plugin_runs_and_resumes(tmp_path):
         "hydra.run.dir=run", cwd=tmp_path, **named,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert {p.name for p in (tmp_path / "run").iterdir()} - {".hydra"} == FOLDER
+    found = {p.name for p in (tmp_path / "run").iterdir()}
+    assert found >= FOLDER
+    assert not found & STEPPED
     record = json.loads((tmp_path / "run/run.json").read_text())
     assert record["config"]["baseline"] == {"name": "inflate", "amount": 0.25}
     assert [p["kind"] for p in record["plugins"]] == ["baseline"]
@@ -187,7 +196,9 @@ def test_displacement_map_writes_the_same_folder_and_needs_no_encoder(tmp_path):
         "encoder=vgg19", "hydra.run.dir=run", cwd=tmp_path, STYLEEXP_CACHE=tmp_path / "none",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert {p.name for p in (tmp_path / "run").iterdir()} - {".hydra"} == FOLDER
+    found = {p.name for p in (tmp_path / "run").iterdir()}
+    assert found >= FOLDER
+    assert not found & STEPPED
 
 
 @pytest.mark.parametrize("scale", [1.0, 2.0])
@@ -406,6 +417,10 @@ def test_geometric_textures_subdivides_the_source_and_resumes_to_the_same_bits(t
     [
         (["style=rows"], "learns from a mesh, and the style 'rows' is a picture"),
         (["style=bubble", "baseline.levels=0"], "baseline.levels=0"),
+        (["style=bubble", "optim.steps=2"], "optim.steps=2 leaves a level untrained"),
+        (["style=bubble", "style.scale=9"], "the source would get 1"),
+        (["style=bubble", "style.scale=0.01"], "the source would get"),
+        (["style=bubble", "baseline.levels=6", "baseline.base=9999"], "the style would get"),
         (["style=bubble", "source=leaf"], "'leaf' can't be resampled"),
     ],
 )

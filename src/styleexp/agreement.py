@@ -42,7 +42,7 @@ def compare(folder: Path) -> list[dict[str, Any]]:
     a share of the first's root mean square displacement; ``correlation`` that of both
     displacements; ``picture`` the mean absolute difference of four views, in [0, 1]. ``loss`` is
     the mean of the last tenth of the steps, each measured by the run's own renderer.
-    ``style_distance`` is measured by the first run's renderer and encoder for all: the loss at
+    ``held_out_loss`` is measured by the first run's renderer and encoder for all: the loss at
     views that were not trained on, as a share of the source's own; 1 means no style was gained.
     """
     import numpy as np
@@ -81,13 +81,13 @@ def compare(folder: Path) -> list[dict[str, Any]]:
         row["picture"] = float(difference.mean() / 255)
     _draw(pictures, folder / "figure.png")
     settings = json.loads((folder / results[0][0]["run"] / "run.json").read_text(encoding="utf-8"))
-    distances = style_distances(settings["config"], [vertices for _, vertices, *_ in results])
+    distances = held_out_losses(settings["config"], [vertices for _, vertices, *_ in results])
     for (row, *_), distance in zip(results, distances, strict=True):
-        row["style_distance"] = distance
+        row["held_out_loss"] = distance
     return rows
 
 
-def style_distances(
+def held_out_losses(
     settings: dict[str, Any], results: list[np.ndarray]
 ) -> list[float] | list[None]:
     """Loss of each result (vertices, 3) at the style bank's views over the source's loss there.
@@ -169,7 +169,7 @@ def _print_table(rows: list[dict[str, Any]], folder: Path) -> None:
         "status",
         "seconds_per_step",
         "loss",
-        "style_distance",
+        "held_out_loss",
         "distance",
         "correlation",
         "picture",

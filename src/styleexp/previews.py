@@ -28,6 +28,7 @@ from styleexp.check_view import UNAVAILABLE
 from styleexp.errors import UserError
 from styleexp.renderers.base import Cameras, Renderer, Shading
 from styleexp.renderers.soft_raster import SoftRaster
+from styleexp.scene import Scene
 from styleexp.views import orbit, zoom
 
 if TYPE_CHECKING:
@@ -258,6 +259,10 @@ def write_check(result: Result, write: Callable[[str, Callable[[Path], Any]], Pa
     elevations = [v[1] for v in VIEWS] + [15.0] * frames
     azimuths = [v[2] for v in VIEWS] + [360.0 * i / frames for i in range(frames)]
     cameras = framed(points, elevations, azimuths)
+    if isinstance(scene, Scene):
+        renderer = scene.viewer.renderer
+    else:  # a baseline's, which may need none
+        renderer = plugins.build("renderer", scene.config.renderer)
     size, views = preview.check_resolution, slice(0, len(VIEWS))
     drawn = check_views(vertices, faces, cameras, size, preview.platform)
     ious, own = silhouette_iou(
@@ -265,7 +270,7 @@ def write_check(result: Result, write: Callable[[str, Callable[[Path], Any]], Pa
         vertices,
         faces,
         cameras[views],
-        plugins.build("renderer", scene.config.renderer),
+        renderer,
         scene.surface.vertices.device,
     )
 

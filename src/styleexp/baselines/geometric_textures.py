@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,9 +23,9 @@ from styleexp import meshes, shapes
 from styleexp.baselines.face_gan import Critic, Generator, Patch, gradient_penalty
 from styleexp.baselines.pyramid import Level, pyramid, restrict, upsample
 from styleexp.errors import UserError
-from styleexp.geometry import vertex_areas
+from styleexp.geometry import Surface, vertex_areas
 from styleexp.relief import smoother
-from styleexp.scene import Subject, load, normalised
+from styleexp.scene import Subject, load
 from styleexp.stylize import Result, State
 from styleexp.views import step_generator
 
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 NOISE = (1.0, 0.3)
 """Added to the lowest level's input and to the others', in root mean squares of the exemplar."""
 
-PENALTY, RECONSTRUCTION = 0.1, 10.0
+PENALTY, RECONSTRUCTION = 1.0, 10.0
 """Weights of the gradient penalty and of the reconstruction."""
 
 INNER = 0.5
@@ -54,6 +54,9 @@ SMOOTH_LENGTH = 0.5
 
 TRAIN, RECALL, APPLY = 12, 13, 14
 """Streams of random numbers: training, the fixed noise, and the result's."""
+
+LEAST_VERTICES, MOST_VERTICES = 20, 1_000_000
+"""Of source and style: at the lowest level, at the highest."""
 
 LIMITS = {
     "levels": (1, 6),
@@ -106,6 +109,7 @@ class GeometricTextures:
                 raise UserError(
                     f"baseline.{key}={value} is not allowed: give a value from {low} to {high}."
                 )
+        check_size("style", config.base, config.levels)
 
     def prepare(self, config: Config) -> TextureScene:
         """Exemplar and source, subdivided."""
@@ -116,12 +120,18 @@ class GeometricTextures:
                 f"'{config.style.path or config.style.name}' is a picture: choose a mesh as style, "
                 "or another method."
             )
+        if config.optim.steps < self.config.levels:
+            raise UserError(
+                f"optim.steps={config.optim.steps} leaves a level untrained: give at least "
+                f"baseline.levels={self.config.levels} steps."
+            )
         device = subject.surface.vertices.device
         exemplar, fields = fit_exemplar(subject.style, self.config.base, self.config.levels, device)
         # Triangles of the size, in the pattern, that the exemplar's have.
         area = float(_area(subject.surface.vertices, subject.surface.faces))
         own = float(_area(exemplar[0].base, exemplar[0].faces)) * subject.unit**2
-        count = max(20, round(len(exemplar[0].base) * area / own))
+        count = round(len(exemplar[0].base) * area / own)
+        check_size("source", count, self.config.levels)
         shape = subject.frame.apply(subject.source.vertices)
         coarse, project = _resampled(subject.source.name, shape, subject.source.faces, count)
         levels = pyramid(*coarse, self.config.levels, lambda points: project(points)[0], device)
@@ -133,8 +143,8 @@ class GeometricTextures:
             finest.faces.cpu().numpy(),
             repairs,
         )
-        _, surface = normalised(source, device)
-        surface = replace(surface, vertices=finest.base)
+        normals = meshes.vertex_normals(source.vertices, source.faces)
+        surface = Surface(finest.base, finest.faces, torch.from_numpy(normals).float().to(device))
         note = (
             f"the result is not on the source's own faces: '{source.name}' was resampled to "
             f"{len(levels[0].base)} vertices and subdivided to {len(finest.base)}"
@@ -195,7 +205,7 @@ class GeometricTextures:
         """One update of a level's generator after some of its critic, on one patch."""
         level, target = scene.exemplar[number], scene.fields[number]
         generator, critic = state.field[number]["generator"], state.field[number]["critic"]
-        unit = target.square().sum(1).mean().sqrt()
+        unit = _unit(target)
         patch, inner = choose_patch(level, self.config.patch, random)
         real = inner.seen(target / unit)
 
@@ -242,6 +252,18 @@ class GeometricTextures:
         return Result(scene, (moved * normals).sum(axis=1), scene.source.vertices + moved)
 
 
+def check_size(what: str, lowest: int, levels: int) -> None:
+    """Raise `UserError` for a mesh that is too coarse at the lowest level, or too fine at the
+    highest."""
+    highest = lowest * 4 ** (levels - 1)
+    if lowest < LEAST_VERTICES or highest > MOST_VERTICES:
+        raise UserError(
+            f"the {what} would get {lowest} vertices at the lowest level and {highest} at the "
+            f"highest, which must be {LEAST_VERTICES} at least and {MOST_VERTICES} at most: change "
+            "baseline.base, baseline.levels or style.scale."
+        )
+
+
 def choose_patch(level: Level, size: int, random: torch.Generator) -> tuple[Patch, Patch]:
     """About ``size`` faces around a random one, and the innermost of them; all if there are no
     more."""
@@ -274,7 +296,7 @@ def _detailed(
     texture: Float[Tensor, "vertices 3"],
     random: torch.Generator | None,
 ) -> Float[Tensor, "vertices 3"]:
-    unit = scene.fields[number].square().sum(1).mean().sqrt()
+    unit = _unit(scene.fields[number])
     seen = texture / unit
     if random is not None:
         seen = seen + _noise(texture, number, random)
@@ -282,6 +304,11 @@ def _detailed(
         seen = seen + _fixed_noise(scene, texture)
     generator: nn.Module = networks[number]["generator"]  # type: ignore[index]
     return texture + unit * generator(Patch.of(level), seen)
+
+
+def _unit(texture: Tensor) -> Tensor:
+    """The networks see a level's displacements in its exemplar's root mean squares."""
+    return texture.square().sum(1).mean().sqrt().clamp(min=1e-9)
 
 
 def _noise(like: Tensor, number: int, random: torch.Generator) -> Tensor:

@@ -18,7 +18,7 @@ class DisplacementMapConfig:
     name: str = "displacement_map"
     height: float | None = None
     """Half the range of the relief, in radii of the normalised source. null: that of the style
-    mesh's own relief at the pattern's size; for a picture, which doesn't tell, 0.05."""
+    mesh's own relief, for a picture, which doesn't tell, 0.05, both at the pattern's size."""
     patch: float = 0.6
     """Mesh styles: radius of the patch that the height map is taken from, in the style's radii."""
     sharpness: float = 8.0

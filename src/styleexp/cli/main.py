@@ -20,6 +20,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 DEBUG = "debug=true"
 UNKNOWN_CHOICE = r"Could not find '([\w/]+)/([^'/]+)'"
 """Hydra's words for a name that it has no option for."""
+HYDRA_PLUGINS = {"hydra/launcher": "sweep", "hydra/sweeper": "search"}
+"""Choices that Hydra's plugins bring, and the extra that installs those."""
 
 
 def main() -> None:
@@ -47,6 +49,7 @@ def _hydra() -> None:
     from omegaconf.errors import OmegaConfBaseException
 
     from styleexp import compose
+    from styleexp.errors import UserError
     from styleexp.records import first_line
     from styleexp.sweeps import report
 
@@ -69,9 +72,10 @@ def _hydra() -> None:
     except Exception as error:
         if report.begun is None:
             raise
-        traceback.print_exc()  # a worker that was killed, or the launcher's own failure
-        print(f"styleexp: the launcher failed: {first_line(error)}", file=sys.stderr)
+        if not isinstance(error, UserError) or DEBUG in sys.argv:
+            traceback.print_exc()
         report.finish(report.begun)
+        _stop(f"the sweep ended early: {first_line(error)}")
     if report.begun is not None:
         sys.exit(report.exit_code(report.begun))
 
@@ -80,6 +84,7 @@ def _job(config: DictConfig) -> float | None:
     """What Hydra calls for every job, maybe in another process.
 
     A job of a sweep never raises for its own failure, so that the others go on; its folder tells.
+    Those of a search do, as it counts them, and return what it minimises.
     """
     from pathlib import Path
 
@@ -89,10 +94,11 @@ def _job(config: DictConfig) -> float | None:
     from styleexp import compose
     from styleexp.cli.run import run
     from styleexp.errors import UserError
-    from styleexp.sweeps import launchers
+    from styleexp.sweeps import launchers, objective
 
     runtime = HydraConfig.get()
-    in_sweep = not OmegaConf.is_missing(runtime.job, "num")
+    in_search = objective.LEAST_IOU in os.environ
+    in_sweep = not OmegaConf.is_missing(runtime.job, "num") and not in_search
     compose.register()  # a launcher's process has not done so
     code = 0
     try:
@@ -100,8 +106,10 @@ def _job(config: DictConfig) -> float | None:
         typed.threads = typed.threads or launchers.threads_each(runtime)
         code = run(typed, Path(runtime.runtime.output_dir), list(runtime.overrides.task))
     except UserError as error:
-        if not in_sweep:
+        if config.debug or in_search:
             raise
+        if not in_sweep:
+            _stop(str(error))  # raised, Hydra would add a line of its own
         print(f"styleexp: {error}", file=sys.stderr)
     except Exception:
         if not in_sweep:
@@ -111,7 +119,7 @@ def _job(config: DictConfig) -> float | None:
         raise KeyboardInterrupt
     if code and not in_sweep:
         sys.exit(code)
-    return None
+    return objective.objective(Path(runtime.runtime.output_dir)) if in_search else None
 
 
 def _explain_plugin(error: BaseException) -> None:
@@ -133,11 +141,10 @@ def explain(error: BaseException) -> str:
     if choice:
         from styleexp.errors import unknown_name
 
-        if choice[1] == "hydra/launcher":
-            extra = "ray" if choice[2] == "ray" else "sweep"
+        if choice[1] in HYDRA_PLUGINS:
+            extra = "ray" if choice[2] == "ray" else HYDRA_PLUGINS[choice[1]]
             return (
-                f"the launcher '{choice[2]}' is not installed: pip install 'styleexp[{extra}]', or "
-                "choose launcher=basic."
+                f"Hydra's plugin '{choice[2]}' is not installed: pip install 'styleexp[{extra}]'."
             )
         return str(unknown_name(choice[1], choice[2], _options(choice[1])))
     key = re.search(r"Key '(\w+)' (?:is )?not in", text)

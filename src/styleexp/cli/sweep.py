@@ -30,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if not folder.is_dir():
                 raise UserError(f"there is no folder '{folder}'.")
             return commands[given[0]](folder)
-        return _run(_parser().parse_args(given))
+        return _run(_parser().parse_intermixed_args(given))
     except UserError as error:
         print(f"styleexp-sweep: {error}", file=sys.stderr)
         return 2

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from styleexp import meshes
-from styleexp.metrics.content import content, spike
 from styleexp.metrics.patches import Relief, closest, relief_of_mesh, relief_of_result
+from styleexp.metrics.shape import content, spike
 from styleexp.metrics.style import (
     Looks,
     judged,
@@ -82,7 +82,7 @@ def measure(
     ``style_distance`` 0 is the style itself, 1 no style at all (``metrics.style``);
     ``relief_distance`` compares without a neural network; ``relief_rms`` is in radii of the
     normalised source, ``relief_share`` its ratio to the style mesh's own. The content metrics are
-    ``metrics.content``'s.
+    ``metrics.shape``'s.
     """
     unit = pattern_unit(config.style, source, style if isinstance(style, meshes.Mesh) else None)
     found: dict[str, float] = {}

@@ -116,14 +116,15 @@ def _typed(schema: Any, content: Any, where: str) -> Any:
     known = [each.name for each in dataclasses.fields(schema)]
     if not isinstance(content, dict):
         raise UserError(f"{where} is no mapping: its keys are {', '.join(known)}.")
-    for key in content:
+    made = OmegaConf.structured(schema)
+    for key, value in content.items():
         if key not in known:
             raise unknown_name(f"key in {where},", str(key), known)
-    try:
-        return OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), content))
-    except OmegaConfBaseException as error:
-        told = str(error).splitlines()[0].rstrip(".")
-        raise UserError(f"{where} can't be read: {told}.") from error
+        try:
+            made = OmegaConf.merge(made, {key: value})
+        except OmegaConfBaseException as error:
+            raise UserError(f"{where}: {key} can't be {value!r}.") from error
+    return OmegaConf.to_object(made)
 
 
 def experiment_jobs(overrides: Sequence[str]) -> list[list[str]]:

@@ -76,14 +76,23 @@ def finish(folder: Path, name: str | None = None) -> None:
 
 
 def report(jobs: Sequence[Job], folder: Path, title: str) -> None:
-    """Write ``table.csv`` and ``figure.png`` into ``folder`` and show the table."""
+    """Write ``table.csv`` and ``figure.png`` into ``folder`` and show the table.
+
+    The figure is drawn anew only where the table has changed.
+    """
     from styleexp.sweeps.figure import write_figure
 
     rows = table(jobs)
+    before = _content(folder / "table.csv")
     write_table(rows, folder)
-    write_figure(jobs, RunFolder(folder))
+    if before != _content(folder / "table.csv") or not (folder / "figure.png").exists():
+        write_figure(jobs, RunFolder(folder))
     show(rows, title)
     _print(f"{folder / 'figure.png'}, {folder / 'table.csv'}")
+
+
+def _content(path: Path) -> bytes | None:
+    return path.read_bytes() if path.exists() else None
 
 
 def table(jobs: Sequence[Job]) -> list[dict[str, Any]]:

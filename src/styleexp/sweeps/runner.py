@@ -11,7 +11,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 LOG = "log.txt"
 """In a job's folder: what it printed."""
 MOST_DEATHS = 3
-"""A job whose process died so often under this runner has failed."""
+"""A job whose process died so often, with no other job beside it, has failed."""
 POLL = 1.0
 """Seconds between looks at jobs that other runners are at."""
 
@@ -40,6 +40,7 @@ def run(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> None:
     `UserError` where the launcher itself fails without a job having begun.
     """
     deaths: Counter[str] = Counter()
+    suspects: set[str] = set()
     while True:
         states = {job.name: runs.read(job.folder)["status"] for job in jobs}
         for job in jobs:
@@ -52,12 +53,17 @@ def run(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> None:
                 return
             time.sleep(POLL)
             continue
-        before = _progress(folder, waiting)
-        error = _launch(waiting, folder, launcher)
-        deaths.update(j.name for j in waiting if runs.read(j.folder)["status"] == "died")
+        # A worker that dies may take the others with it: what died is tried again alone.
+        batch = [job for job in waiting if job.name not in suspects] or waiting[:1]
+        before = _progress(folder, batch)
+        error = _launch(batch, folder, launcher)
+        died = [job.name for job in batch if runs.read(job.folder)["status"] == "died"]
+        if len(batch) == 1:
+            deaths.update(died)
+        suspects.update(died)
         if error is None:
             continue
-        if _progress(folder, waiting) == before:
+        if _progress(folder, batch) == before:
             raise UserError(
                 f"the launcher failed before any job began ({records.first_line(error)}): see "
                 f"{folder} or try --launcher basic."
@@ -68,13 +74,11 @@ def run(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> None:
 def retry(jobs: Sequence[Planned]) -> None:
     """Let failed jobs run again, from their checkpoints where they have one."""
     for job in jobs:
-        run_folder = records.RunFolder(job.folder)
-        try:
-            with locks.hold(job.folder):
-                if runs.status(job.folder) == "failed":
-                    run_folder.write_status("interrupted", reason="failed, to be tried again")
-        except locks.Busy:
+        if runs.status(job.folder) != "failed":
             continue
+        with suppress(locks.Busy), locks.hold(job.folder):
+            again = "failed, to be tried again"
+            records.RunFolder(job.folder).write_status("interrupted", reason=again)
 
 
 def _give_up(job: Planned, folder: Path) -> None:

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 VIEWS = tuple((elevation, azimuth) for elevation in (-20, 30) for azimuth in range(0, 360, 60))
 """Elevation and azimuth, in degrees, of the twelve views whose silhouettes are compared."""
 RESOLUTION = 256
+LARGE = 15
+"""Grid cells that a face may span before it is looked at by itself."""
 SAMPLES = 10_000
 """Points on each surface that Chamfer and Hausdorff distances are taken from."""
 
@@ -150,9 +152,15 @@ def _near_pairs(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     low, high = triangles.min(axis=1), triangles.max(axis=1)
     cell = max(float(np.percentile((high - low).max(axis=1), 95)), 1e-12)
     first, last = (np.floor(x / cell).astype(np.int64) for x in (low, high))
-    # A face far larger than the rest would lie in a great many cells.
-    last = np.minimum(last, first + 15)
-    spans = last - first + 1
+    # A face far larger than the rest would lie in a great many cells: it meets all by itself.
+    large = np.flatnonzero((last - first).max(axis=1) > LARGE)
+    meets = [
+        np.flatnonzero(
+            ((low[k] <= high) & (low <= high[k])).all(axis=1) & (np.arange(len(low)) != k)
+        )
+        for k in large
+    ]
+    spans = np.where(np.isin(np.arange(len(low)), large)[:, None], 0, last - first + 1)
     count = spans.prod(axis=1)
     owner = np.repeat(np.arange(len(triangles)), count)
     step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
@@ -176,7 +184,8 @@ def _near_pairs(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     follow = end - np.arange(len(key)) - 1
     left = np.repeat(np.arange(len(key)), follow)
     right = left + 1 + np.arange(follow.sum()) - np.repeat(np.cumsum(follow) - follow, follow)
-    one, other = owner[left], owner[right]
+    one = np.concatenate([owner[left], np.repeat(large, [len(m) for m in meets])])
+    other = np.concatenate([owner[right], *meets])
     overlap = ((low[one] <= high[other]) & (low[other] <= high[one])).all(axis=1)
     pairs = np.unique(np.sort(np.stack([one[overlap], other[overlap]], axis=1), axis=1), axis=0)
     return pairs[:, 0], pairs[:, 1]
