@@ -28,6 +28,12 @@ def test_wheel_holds_every_configuration_and_module(wheel):
     held = set(zipfile.ZipFile(wheel).namelist())
     files = {f"styleexp/conf/{p.relative_to(ROOT / 'conf')}" for p in ROOT.glob("conf/**/*.yaml")}
     files |= {str(p.relative_to(ROOT / "src")) for p in ROOT.glob("src/styleexp/**/*.py")}
+    files |= {f"styleexp/notebooks/{path.name}" for path in ROOT.glob("reports/*.py")}
+    files |= {
+        str(path.relative_to(ROOT / "src"))
+        for folder in ("assets", "vendor")
+        for path in (ROOT / "src/styleexp/reports" / folder).iterdir()
+    }
     assert not files - held
     assert "styleexp/py.typed" in held
     assert any(name.endswith("licenses/LICENSE") for name in held)

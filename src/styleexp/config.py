@@ -246,6 +246,8 @@ class Config:
     optim: OptimConfig = option(default_factory=OptimConfig)
     preview: PreviewConfig = option(default_factory=PreviewConfig)
     metrics: MetricsConfig = option(default_factory=MetricsConfig)
+    report: bool = True
+    """Write ``report.html``, the run's page: about 3 MB and a second for 20 000 faces."""
     strength: float = 1.0
     """Factor on the final displacement; 0 gives the source back."""
     device: str = "auto"

@@ -39,6 +39,7 @@ FILES = (
     "check.gif",
     "check.json",
     "metrics.json",
+    "report.html",
     "run.json",
 )
 """What a run may leave in its folder; the record last, by which it is known as a run's."""

@@ -189,8 +189,13 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
 
     if state is not None and not _optimise(method, scene, state, folder):
         return 130
-    written = _write_results(method, scene, state, folder)
+    result = method.finish(scene, state)
+    written = _write_results(result, folder)
     seconds = time.perf_counter() - started
+    if config.report:  # last, as it shows what the others are about
+        from styleexp.reports import page
+
+        written.insert(0, page.write_ended(folder.path, result, seconds))
     folder.write_status("done", step=state.step if state else 0, seconds=round(seconds, 1))
     print(f"done in {seconds:.0f} s")
     _print_paths(written)
@@ -213,22 +218,20 @@ def _optimise(method: Method, scene: Subject, state: State, folder: records.RunF
     return True
 
 
-def _write_results(
-    method: Method, scene: Subject, state: State | None, folder: records.RunFolder
-) -> list[Path]:
+def _write_results(result: Result, folder: records.RunFolder) -> list[Path]:
     from styleexp import previews
 
-    result = method.finish(scene, state)
     for name in ("result.ply", "result.obj", "result.glb"):
         result.save(folder.path / name)
     folder.write("preview.png", lambda path: previews.write_preview(result, path))
     folder.write("turntable.gif", lambda path: previews.write_turntable(result, path))
     names = ("preview.png", "turntable.gif", "result.glb", "result.ply", "result.obj")
     written = [folder.path / name for name in names]
-    found = _measure(result, scene.config)
+    config = result.scene.config
+    found = _measure(result, config)
     folder.write_json("metrics.json", found)
     print("  ".join(f"{name} {found[name]:.3g}" for name in SHOWN_METRICS if name in found))
-    if scene.config.preview.name == "pyrender":
+    if config.preview.name == "pyrender":
         written += previews.write_check(result, folder.write)
     return written
 

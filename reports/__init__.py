@@ -1,0 +1,1 @@
+"""Notebooks in percent format, packaged: ``styleexp-report FOLDER --notebooks`` executes them."""

@@ -1,0 +1,122 @@
+"""``styleexp-report``: pages to look at, of runs, sweeps and the user study."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from styleexp.errors import UserError
+
+DESCRIPTION = """\
+Write one self-contained HTML page about a run, or about all runs below a folder, and print its
+path. 'styleexp-report study --help' tells of the user study."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; return 0, or 2 after printing what the user can mend."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        written = study(given[1:]) if given[:1] == ["study"] else report(given)
+        for path in written:
+            print(path)
+    except UserError as error:
+        print(f"styleexp-report: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        where = f"'{error.filename}'" if error.filename else "the page"
+        print(f"styleexp-report: {where} cannot be written ({error.strerror}).", file=sys.stderr)
+        return 2
+    return 0
+
+
+def report(given: list[str]) -> list[Path]:
+    """The pages that these arguments ask for."""
+    options = _parser().parse_args(given)
+    if not options.folder.is_dir():
+        raise UserError(f"there is no folder '{options.folder}': give a run's or a sweep's.")
+    if options.notebooks is not None:
+        from styleexp.reports import notebooks
+
+        pages, left_out = notebooks.execute(options.folder, options.notebooks)
+        for told in left_out:
+            print(f"styleexp-report: {told}", file=sys.stderr)
+        return pages
+    from styleexp.reports import folders, page, sweep_page
+
+    if folders.is_run(options.folder):
+        written = page.rewrite(options.folder)
+    else:
+        written = sweep_page.write(options.folder, not options.no_run_pages)
+    if options.open:
+        import webbrowser
+
+        webbrowser.open(written.resolve().as_uri())
+    return [written]
+
+
+def study(given: list[str]) -> list[Path]:
+    """The study's page, or what its answers say."""
+    options = _study_parser().parse_args(given)
+    if options.analyse:
+        from styleexp.reports import study_results
+
+        found = study_results.read(options.analyse)
+        for told in found.left_out:
+            print(f"styleexp-report: {told}", file=sys.stderr)
+        return study_results.analyse(found, options.out or options.analyse[0].parent)
+    if options.folder is None:
+        raise UserError("give the folder with the runs to be rated, or --analyse and the answers.")
+    if not options.folder.is_dir():
+        raise UserError(f"there is no folder '{options.folder}': give one with finished runs.")
+    from styleexp.reports import study as study_page
+
+    return [study_page.write(options.folder, options.seed, options.title)]
+
+
+def _study_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="styleexp-report study",
+        description="The user study of Fig. 9: write a page on which people rate every finished "
+        "run below a folder (study.html), or analyse the files that they saved.",
+    )
+    parser.add_argument("folder", type=Path, nargs="?", metavar="FOLDER", help="with the runs")
+    parser.add_argument("--title", default="Rating of stylised meshes", help="of the page")
+    parser.add_argument("--seed", type=int, default=0, help="enters into the order of the pairs")
+    parser.add_argument(
+        "--analyse",
+        type=Path,
+        nargs="+",
+        metavar="FILE",
+        help="participants' files: write fig9.png, fig9.csv, ratings.csv and study.json",
+    )
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="for them (the first file's)")
+    return parser
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="styleexp-report",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="of a run, a sweep, or several")
+    parser.add_argument(
+        "--notebooks",
+        nargs="*",
+        metavar="NAME",
+        help="execute the notebooks of the paper's figures that have runs here, or those named, "
+        "to FOLDER/notebooks",
+    )
+    parser.add_argument("--open", action="store_true", help="open the page in the browser")
+    parser.add_argument(
+        "--no-run-pages",
+        action="store_true",
+        help="don't write pages for finished runs of a sweep that have none",
+    )
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,191 @@
+"""Run folders as they are found on disk, finished or not, whole or damaged."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import statistics
+from dataclasses import dataclass, field
+from pathlib import Path, PurePath
+from typing import Any
+
+from styleexp import locks
+
+MARKS = ("run.json", "status.json", ".hydra/overrides.yaml")
+"""Files that tell a run's folder; Hydra's is there before the run has a record."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run's files, read once. What is missing is empty, what is damaged is in ``problems``."""
+
+    folder: Path
+    record: dict[str, Any] = field(default_factory=dict)
+    """``run.json``."""
+    status: dict[str, Any] = field(default_factory=dict)
+    """``status.json``."""
+    steps: list[dict[str, float]] = field(default_factory=list)
+    """``metrics.jsonl``."""
+    metrics: dict[str, float] = field(default_factory=dict)
+    """``metrics.json``: what was measured on the result."""
+    overrides: list[str] = field(default_factory=list)
+    problems: tuple[str, ...] = ()
+
+    @property
+    def state(self) -> str:
+        """``done``, ``running``, ``interrupted``, ``failed``; ``missing`` if it never began,
+        ``died`` if it calls itself running and no process is at it."""
+        return str(self.status.get("status", "missing"))
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The configuration with dotted keys."""
+        return flatten(self.record.get("config") or {})
+
+    @property
+    def title(self) -> str:
+        """Source and style in words."""
+        return f"{self.part('source')} in the style of {self.part('style')}"
+
+    def part(self, kind: str) -> str:
+        """Name of the ``source`` or ``style``."""
+        chosen = (self.record.get("config") or {}).get(kind) or {}
+        if chosen.get("path"):
+            return PurePath(chosen["path"]).stem
+        return str(chosen.get("name") or f"unknown {kind}")
+
+    @property
+    def command(self) -> str:
+        """What to type to run it again."""
+        return shlex.join(["styleexp", *self.overrides])
+
+    @property
+    def seconds(self) -> float | None:
+        """Wall time of a finished run."""
+        value = self.status.get("seconds")
+        return float(value) if isinstance(value, int | float) else None
+
+    @property
+    def summary(self) -> dict[str, float]:
+        """Numbers to compare runs by: the loss's mean over the last tenth of the steps, and
+        whatever was measured on the result."""
+        found: dict[str, float] = {}
+        losses = [s["loss"] for s in self.steps if "loss" in s]
+        if losses:
+            found["loss"] = statistics.fmean(losses[-max(1, len(losses) // 10) :])
+        if self.state == "done" and self.steps and "rms_displacement" in self.steps[-1]:
+            found["rms_displacement"] = self.steps[-1]["rms_displacement"]
+        return found | self.metrics
+
+
+def read(folder: Path) -> Run:
+    """Read what there is of a run."""
+    problems: list[str] = []
+
+    def load(name: str) -> dict[str, Any]:
+        path = folder / name
+        if not path.is_file():
+            return {}
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            if not isinstance(content, dict):
+                raise ValueError("it holds no object")
+        except (OSError, ValueError) as error:
+            problems.append(f"{name} cannot be read ({error}).")
+            return {}
+        return content
+
+    record, status, measured = load("run.json"), load("status.json"), load("metrics.json")
+    if status.get("status") == "running" and not locks.held(folder):
+        status["status"] = "died"
+    metrics = {
+        name: float(value)
+        for name, value in measured.items()
+        if isinstance(value, int | float) and not isinstance(value, bool)
+    }
+    overrides = record.get("overrides")
+    return Run(
+        folder,
+        record,
+        status,
+        _steps(folder / "metrics.jsonl", problems),
+        metrics,
+        _composed(folder) if overrides is None else list(overrides),
+        tuple(problems),
+    )
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a run left something here."""
+    return any((folder / mark).is_file() for mark in MARKS)
+
+
+def find(folder: Path) -> list[Run]:
+    """Every run at or below ``folder``, in the order of job numbers, then of names.
+
+    Jobs that a sweep's ``jobs.json`` or a plan's ``manifest.json`` lists and that never began are
+    there with their overrides and the state ``missing``.
+    """
+    found = {path.parents[m.count("/")]: None for m in MARKS for path in folder.rglob(m)}
+    planned: dict[Path, list[str]] = {}
+    for path in folder.rglob("jobs.json"):
+        for number, overrides in enumerate(_listed(path) or []):
+            planned[path.parent / str(number)] = list(overrides)
+    for path in folder.rglob("manifest.json"):
+        for name, job in dict(_listed(path) or {}).items():
+            if isinstance(job, dict) and job.get("state") != "outdated":
+                planned[path.parent / name] = list(job.get("overrides") or [])
+    runs = [read(path) for path in found]
+    runs += [Run(at, overrides=given) for at, given in planned.items() if at not in found]
+    return sorted(runs, key=lambda run: natural(run.folder, folder))
+
+
+def _listed(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))["jobs"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None  # another program's file of that name
+
+
+def natural(path: Path, root: Path) -> list[tuple[int, int, str]]:
+    """Sort key by which job 10 follows job 9."""
+    parts = path.relative_to(root).parts
+    return [(0, int(p), "") if p.isdigit() else (1, 0, p) for p in parts]
+
+
+def flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested dictionaries as one, with dotted keys."""
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            flat |= flatten(value, f"{prefix}{key}.")
+        else:
+            flat[prefix + key] = value
+    return flat
+
+
+def _steps(path: Path, problems: list[str]) -> list[dict[str, float]]:
+    if not path.is_file():
+        return []
+    steps, damaged = [], 0
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            step = json.loads(line)
+            step["step"] = int(step["step"])
+            steps.append(step)
+        except (ValueError, KeyError, TypeError):
+            damaged += 1
+    if damaged:
+        problems.append(f"metrics.jsonl: {damaged} damaged lines were left out.")
+    return steps
+
+
+def _composed(folder: Path) -> list[str]:
+    """The overrides that Hydra wrote down for a job that stopped before it had a record."""
+    path = folder / ".hydra" / "overrides.yaml"
+    if not path.is_file():
+        return []
+    from omegaconf import OmegaConf
+
+    found = OmegaConf.to_container(OmegaConf.load(path))
+    return [str(each) for each in found] if isinstance(found, list) else []

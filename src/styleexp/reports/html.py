@@ -1,0 +1,144 @@
+"""Pages of one file that ask the network for nothing.
+
+Scripts, styles, pictures and meshes are inside. A content security policy names the page's one
+script by its hash and allows nothing from elsewhere, so a name from a file can't become code even
+if it were not escaped (it is: the templates escape everything).
+"""
+
+from __future__ import annotations
+
+import base64
+import functools
+import gzip
+import hashlib
+import io
+import json
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from markupsafe import Markup
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+GZIP_LEVEL = 6
+THUMBNAIL = 200
+"""Pixels on the longer side of a sweep's small pictures."""
+
+
+def render(template: str, scripts: Sequence[str], **values: Any) -> str:
+    """A page from its template, with the scripts of these names in their order."""
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.FunctionLoader(lambda name: asset(name)),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"number": number, "duration": duration}
+    script = "\n".join(asset(name) for name in scripts)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    return environment.get_template(template).render(
+        script=Markup(script),  # ours, without "</script"
+        script_hash=f"sha256-{digest}",
+        style=Markup(asset("page.css")),
+        **values,
+    )
+
+
+def asset(name: str) -> str:
+    """The text of one of our templates, styles or scripts."""
+    return (resources.files("styleexp.reports") / "assets" / name).read_text(encoding="utf-8")
+
+
+@functools.cache
+def viewer() -> dict[str, str]:
+    """The 3D viewer: ``code``, compressed and in base64, and its ``licences``."""
+    vendor = resources.files("styleexp.reports") / "vendor"
+    code = (vendor / "model-viewer-umd.min.js.gz").read_bytes()
+    return {
+        "code": base64.b64encode(code).decode(),
+        "licences": (vendor / "model-viewer.LICENCES.txt").read_text(encoding="utf-8"),
+    }
+
+
+def packed(content: bytes) -> str:
+    """Bytes for a data block: compressed, in base64. The page inflates them."""
+    return base64.b64encode(gzip.compress(content, GZIP_LEVEL, mtime=0)).decode()
+
+
+def data_uri(picture: Image.Image, longest: int, kind: str = "WEBP") -> str:
+    """A picture, scaled down to ``longest`` pixels on its longer side, as a data URI."""
+    shown = picture.convert("RGB")
+    shown.thumbnail((longest, longest))
+    out = io.BytesIO()
+    shown.save(out, kind, quality=85)
+    return f"data:image/{kind.lower()};base64,{base64.b64encode(out.getvalue()).decode()}"
+
+
+def picture(path: Path, longest: int) -> str | None:
+    """A picture file as a data URI, an animation's first frame; None if it can't be read."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as opened:
+            return data_uri(opened, longest)
+    except OSError:
+        return None
+
+
+def views(folder: Path, row: int) -> list[Image.Image]:
+    """The four views in a row of a run's ``preview.png``: 0 the source, 1 the style, 2 the result.
+
+    Empty where there is no such picture or it is laid out in another way.
+    """
+    from PIL import Image
+
+    try:
+        with Image.open(folder / "preview.png") as opened:
+            sheet = opened.convert("L")
+    except OSError:
+        return []
+    size = sheet.width // 4
+    band = max(18, size // 12)  # as `previews.sheet` does it
+    if sheet.height != 3 * (size + band):
+        return []
+    top = row * (size + band) + band
+    return [sheet.crop((k * size, top, (k + 1) * size, top + size)) for k in range(4)]
+
+
+def save(path: Path, text: str) -> Path:
+    """Write a page whole or not at all."""
+    from styleexp.records import RunFolder
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return RunFolder(path.parent).write(
+        path.name, lambda partial: partial.write_text(text, encoding="utf-8")
+    )
+
+
+def number(value: Any) -> str:
+    """A number for people: four digits; anything else as it stands."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return plain(value)
+    return str(value) if isinstance(value, int) else f"{value:.4g}"
+
+
+def plain(value: Any) -> str:
+    """A configuration's value as one would type it."""
+    if value is None or isinstance(value, bool | list | dict):
+        return json.dumps(value)
+    return str(value)
+
+
+def duration(seconds: float | None) -> str:
+    """Seconds for people."""
+    if seconds is None:
+        return "–"
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.1f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"

@@ -1,0 +1,272 @@
+"""What the notebooks of ``reports/`` share: a table of runs, their figure, the paper's claims.
+
+They read collected tables and saved files only; nothing here trains or renders.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from styleexp.errors import UserError
+from styleexp.reports import folders, html, sweep_page
+from styleexp.reports.collect import collect
+from styleexp.reports.shown import read_result
+
+if TYPE_CHECKING:
+    import pandas
+    from IPython.display import HTML
+    from IPython.display import Image as Shown
+    from matplotlib.figure import Figure
+
+VERDICTS = {True: "yes", False: "no", None: "can't be told"}
+RANDOM = "vgg19_random"
+"""The encoder whose results mean nothing."""
+
+
+def runs(folder: str | Path, *experiments: str) -> pandas.DataFrame:
+    """The collected runs of these experiments below ``folder``, in their order; of all, if none.
+
+    Besides the columns of `collect` there are ``path``, ``pair`` (source-style), ``seed``, and
+    ``axis.*``, the overrides that not all runs have. Raises `UserError` where there is no such run.
+    """
+    folder = Path(folder)
+    found = {run.folder: run for run in folders.find(folder)}
+    kept = {
+        path: run for path, run in found.items() if not experiments or belongs(run, experiments)
+    }
+    if not kept:
+        told = " or ".join(experiments) or "any experiment"
+        raise UserError(f"there is no run of {told} below '{folder}'.")
+    axes = sweep_page.axes(list(kept.values()))
+    frame = collect(folder)
+    frame["path"] = [folder / run for run in frame["run"]]
+    frame = frame.set_index("path", drop=False).reindex(list(kept))
+    frame["path"] = list(kept)
+    frame["status"] = [run.state for run in kept.values()]
+    frame["pair"] = [f"{run.part('source')}-{run.part('style')}" for run in kept.values()]
+    given = [sweep_page.settings(run) for run in kept.values()]
+    frame["seed"] = [each.get(sweep_page.SEED, "0") for each in given]
+    for key in axes:
+        frame[f"axis.{key}"] = [each.get(key, sweep_page.OMITTED) for each in given]
+    return frame.reset_index(drop=True).dropna(axis=1, how="all")
+
+
+def belongs(run: folders.Run, experiments: Sequence[str]) -> bool:
+    """Whether a run is of one of the experiments: it was started so, or lies in its folder."""
+    named = sweep_page.settings(run).get("experiment")
+    return named in experiments or any(part in experiments for part in run.folder.parts)
+
+
+def caution(frame: pandas.DataFrame) -> str:
+    """What a reader has to know of these runs before believing them, as Markdown; may be empty."""
+    told = []
+    not_done = frame[frame["status"] != "done"]
+    if len(not_done):
+        counts = ", ".join(f"{n} {state}" for state, n in not_done["status"].value_counts().items())
+        told.append(f"{len(not_done)} of {len(frame)} runs are not there: {counts}.")
+    encoders = frame.get("config.encoder.name")
+    if encoders is not None and (encoders == RANDOM).any():
+        told.append("The encoder has random weights: nothing here says anything about style.")
+    steps = frame.get("config.optim.steps")
+    if steps is not None and steps.dropna().max() < 100:
+        told.append(f"The runs have {steps.dropna().max():g} steps, the paper's 1000.")
+    if "seed" in frame and frame["seed"].nunique() == 1:
+        told.append("There is one seed: differences may be chance.")
+    return "\n".join(f"- **{each}**" for each in told)
+
+
+def pictures(frame: pandas.DataFrame, columns: str, rows: str = "pair") -> Shown:
+    """The results, laid out by two columns of the table: the paper's figure from saved files.
+
+    Each row begins with its source. What did not finish is a cell that says so.
+    """
+    from matplotlib.figure import Figure
+
+    across, down = _order(frame[columns]), _order(frame[rows])
+    figure = Figure(figsize=(1.9 * (len(across) + 1), 2.05 * len(down) + 0.2), layout="constrained")
+    axes = figure.subplots(len(down), len(across) + 1, squeeze=False)
+    for axis in axes.ravel():
+        axis.set_axis_off()
+    for y, row in enumerate(down):
+        line = frame[frame[rows] == row]
+        for x, column in enumerate(across):
+            axis, cell = axes[y, x + 1], line[line[columns] == column]
+            if y == 0:
+                axis.set_title(str(column), fontsize=9)
+            if cell.empty:
+                continue
+            first = cell.iloc[0]
+            seen = html.views(Path(first["path"]), 2)
+            if first["status"] != "done" or not seen:
+                axis.text(0.5, 0.5, first["status"], ha="center", color="#a3262b")
+                axis.set(xlim=(0, 1), ylim=(0, 1))
+                continue
+            axis.imshow(seen[0], cmap="gray", vmin=0, vmax=255)
+        _show_row_head(axes[y, 0], line, str(row))
+    return _picture(figure)
+
+
+def _show_row_head(axis: Any, line: pandas.DataFrame, label: str) -> None:
+    """The row's label, and its source and style out of a preview."""
+    axis.set_title(label, fontsize=9)
+    for path in line["path"]:
+        seen = [html.views(Path(path), row) for row in (0, 1)]
+        if all(seen):
+            pair = np.concatenate([np.asarray(row[0]) for row in seen], axis=1)
+            axis.imshow(pair, cmap="gray", vmin=0, vmax=255)
+            return
+
+
+def bars(frame: pandas.DataFrame, by: str, metrics: Sequence[str]) -> Shown:
+    """A small chart for each metric: a dot for each run, a line for the mean."""
+    from matplotlib.figure import Figure
+
+    kept = [m for m in metrics if f"metric.{m}" in frame or m in frame]
+    if not kept:
+        raise UserError(f"none of {', '.join(metrics)} was measured: see 'styleexp-metrics run'.")
+    figure = Figure(figsize=(3.4 * len(kept), 3.0), layout="constrained")
+    for axis, name in zip(figure.subplots(1, len(kept), squeeze=False)[0], kept, strict=True):
+        column = f"metric.{name}" if f"metric.{name}" in frame else name
+        groups = _order(frame[by])
+        for place, group in enumerate(groups):
+            values = frame.loc[frame[by] == group, column].dropna().to_numpy(dtype=float)
+            axis.plot([place] * len(values), values, "o", color="#1f5fa8", alpha=0.7)
+            if len(values):
+                axis.hlines(values.mean(), place - 0.3, place + 0.3, color="#1d2230")
+        axis.set_xticks(range(len(groups)), groups, rotation=30, ha="right")
+        axis.set_title(name, fontsize=10)
+        axis.grid(axis="y", color="#d9d7d0")
+    return _picture(figure)
+
+
+def _picture(figure: Figure) -> Shown:
+    """A figure to show in a notebook, whatever its backend."""
+    import io
+
+    from IPython.display import Image
+
+    out = io.BytesIO()
+    figure.savefig(out, format="png", dpi=110)
+    return Image(out.getvalue())
+
+
+def mean(frame: pandas.DataFrame, metric: str, **where: Any) -> float:
+    """Mean of a metric over the finished runs that match; NaN where none was measured.
+
+    ``where`` names columns, with ``__`` for a dot: ``axis__layers="low"``.
+    """
+    column = f"metric.{metric}" if f"metric.{metric}" in frame else metric
+    if column not in frame:
+        return math.nan
+    kept = frame[frame["status"] == "done"]
+    for key, value in where.items():
+        key = key.replace("__", ".")
+        if key not in kept:
+            return math.nan
+        kept = kept[kept[key] == value]
+    return float(kept[column].astype(float).mean())
+
+
+def slope(path: str | Path) -> float:
+    """Root mean square change of the displacement along the result's edges, by their length: how
+    steep, and with the height how fine, the relief is. NaN without a result."""
+    from styleexp.reports.glb import edges
+
+    file = Path(path) / "result.ply"
+    if not file.is_file():
+        return math.nan
+    vertices, faces, displacement = read_result(file)
+    if displacement is None:
+        return math.nan
+    a, b = edges(faces).T
+    length = np.linalg.norm(vertices[a] - vertices[b], axis=1)
+    steep = np.abs(displacement[a] - displacement[b])[length > 0] / length[length > 0]
+    return float(np.sqrt(np.square(steep).mean()))
+
+
+@dataclass(frozen=True)
+class Claim:
+    """Something that the paper says, beside what the runs show."""
+
+    paper: str
+    ours: str
+    holds: bool | None
+    """None where it can't be told."""
+
+
+def smaller(paper: str, first: tuple[str, float], second: tuple[str, float], what: str) -> Claim:
+    """The claim that the first number is smaller than the second; can't be told without both."""
+    ours = f"{what}: {first[0]} {first[1]:.3g}, {second[0]} {second[1]:.3g}"
+    if math.isnan(first[1]) or math.isnan(second[1]):
+        return Claim(paper, f"{ours} (nan: not measured)", None)
+    return Claim(paper, ours, first[1] < second[1])
+
+
+def claims(*each: Claim) -> HTML:
+    """The claims as a table to show."""
+    import pandas
+    from IPython.display import HTML
+
+    rows = [(c.paper, c.ours, VERDICTS[c.holds]) for c in each]
+    frame = pandas.DataFrame(rows, columns=["the paper says", "we see", "does it hold"])
+    with pandas.option_context("display.max_colwidth", None):  # else pandas cuts sentences off
+        return HTML(frame.to_html(index=False, border=0))
+
+
+def table(frame: pandas.DataFrame, metrics: Sequence[str] = ()) -> pandas.DataFrame:
+    """The runs' axes and numbers, for people: those of ``metrics`` that are there, or all."""
+    axes = [column for column in frame if str(column).startswith("axis.")]
+    measured = [f"metric.{m}" for m in metrics] or [c for c in frame if c.startswith("metric.")]
+    wanted = ["pair", *axes, "seed", "status", "seconds", "loss", *measured]
+    shown = frame[[column for column in wanted if column in frame]]
+    return shown.rename(columns=lambda name: name.split(".", 1)[-1] if "." in name else name)
+
+
+def save(frame: pandas.DataFrame, folder: str | Path | None, name: str) -> None:
+    """Write a table as ``name.csv`` and ``name.tex`` (booktabs), if there is a folder for it."""
+    if folder is None:
+        return
+    from styleexp.records import RunFolder
+
+    target = RunFolder(Path(folder))
+    target.path.mkdir(parents=True, exist_ok=True)
+    target.write(f"{name}.csv", lambda path: frame.to_csv(path, index=False))
+    target.write(f"{name}.tex", lambda path: path.write_text(latex(frame), encoding="utf-8"))
+
+
+def latex(frame: pandas.DataFrame) -> str:
+    """A table for a paper that loads booktabs; text is escaped, numbers have four digits."""
+
+    def cell(value: Any) -> str:
+        if isinstance(value, float | np.floating):
+            return "--" if math.isnan(value) else f"{value:.4g}"
+        return "".join(LATEX.get(letter, letter) for letter in str(value))
+
+    kinds = ["r" if frame[column].dtype.kind in "fi" else "l" for column in frame]
+    lines = [r"\begin{tabular}{" + "".join(kinds) + "}", r"\toprule"]
+    lines.append(" & ".join(cell(column) for column in frame) + r" \\")
+    lines.append(r"\midrule")
+    for row in frame.itertuples(index=False):
+        lines.append(" & ".join(cell(value) for value in row) + r" \\")
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
+
+
+LATEX = {letter: f"\\{letter}" for letter in "&%$#_{}"} | {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+}
+
+
+def _order(column: pandas.Series) -> list[Any]:
+    values = list(dict.fromkeys(column))
+    try:
+        return sorted(values, key=float)
+    except (TypeError, ValueError):
+        return values

@@ -1,0 +1,163 @@
+"""What a page shows in 3D: source, style and result, from a live run or from its folder."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from styleexp import meshes
+from styleexp.errors import UserError
+from styleexp.reports import glb
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
+    from styleexp.reports.folders import Run
+    from styleexp.stylize import Result
+
+WITHIN = 99.5
+"""Percent of the vertices whose displacement the heat map's colours tell apart; a few spikes would
+otherwise leave no colour for the rest."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A mesh to show, in the unit sphere of whatever it is compared with."""
+
+    vertices: Float[np.ndarray, "vertices 3"]
+    faces: Int[np.ndarray, "faces 3"]
+
+
+@dataclass(frozen=True)
+class Shown:
+    """All three, as far as they are there."""
+
+    source: Shape | None = None
+    style: Shape | np.ndarray | None = None
+    """A mesh, or a picture of shape (height, width, 3) in [0, 1]."""
+    result: Shape | None = None
+    displacement: Float[np.ndarray, " vertices"] | None = None
+    """Of the result's vertices, in the source's own units."""
+    radius: float = 1.0
+    """Of the source's bounding sphere, in its own units."""
+    missing: tuple[str, ...] = ()
+    """A sentence for each that is not there."""
+
+    @property
+    def reach(self) -> float:
+        """The displacement at which the heat map's colours end."""
+        if self.displacement is None or not len(self.displacement):
+            return 0.0
+        return float(np.percentile(np.abs(self.displacement), WITHIN))
+
+    def files(self, bare: bool = False) -> dict[str, bytes]:
+        """A GLB for each mesh; source and result share their frame. See `glb.glb` for ``bare``."""
+        pair = [shape for shape in (self.source, self.result) if shape is not None]
+        reach = max((float(np.abs(shape.vertices).max()) for shape in pair), default=1.0)
+        extent = math.ceil(1e4 * reach) / 1e4  # the same from a file in single precision
+        values = None
+        if self.displacement is not None:
+            values = np.clip(self.displacement / (self.reach or 1.0), -1, 1)
+        made = {}
+        if self.source is not None:
+            made["source"] = glb.glb(self.source.vertices, self.source.faces, extent, bare=bare)
+        if isinstance(self.style, Shape):
+            reach = float(np.abs(self.style.vertices).max())
+            made["style"] = glb.glb(self.style.vertices, self.style.faces, reach, bare=bare)
+        if self.result is not None:
+            made["result"] = glb.glb(self.result.vertices, self.result.faces, extent, values, bare)
+        return made
+
+
+def of(result: Result) -> Shown:
+    """What a run that has just ended shows."""
+    scene = result.scene
+    return Shown(
+        source=Shape(scene.frame.apply(scene.source.vertices), scene.source.faces),
+        style=_style(scene.style),
+        result=Shape(scene.frame.apply(result.vertices), scene.source.faces),
+        displacement=result.displacement,
+        radius=scene.frame.scale,
+    )
+
+
+def read(run: Run) -> Shown:
+    """What a run's folder shows. Source and style come from the files that they came from, if those
+    are still the same."""
+    missing: list[str] = []
+    source, style = _load(run, missing)
+    found: dict[str, Any] = {}
+    frame = None
+    if source is not None:
+        frame = meshes.normalisation(source.vertices)
+        found["source"] = Shape(frame.apply(source.vertices), source.faces)
+    if style is not None:
+        found["style"] = _style(style)
+    path = run.folder / "result.ply"
+    if path.is_file():
+        try:
+            vertices, faces, displacement = read_result(path)
+            frame = frame or meshes.normalisation(vertices)
+        except Exception as error:  # trimesh raises almost anything on a damaged file
+            missing.append(f"The result can't be shown: result.ply cannot be read ({error}).")
+        else:
+            found |= {"result": Shape(frame.apply(vertices), faces), "displacement": displacement}
+    else:
+        missing.append("There is no result: the folder has no result.ply.")
+    return Shown(**found, radius=frame.scale if frame else 1.0, missing=tuple(missing))
+
+
+def read_result(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Vertices (n, 3), faces (m, 3) and displacement (n,) of a ``result.ply``, rows as stored."""
+    import trimesh
+
+    mesh = trimesh.load_mesh(path, process=False)
+    stored = mesh.metadata["_ply_raw"]["vertex"]["data"]  # where trimesh keeps custom properties
+    displacement = None
+    if "displacement" in stored.dtype.names:
+        displacement = np.asarray(stored["displacement"], dtype=float).ravel()
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces), displacement
+
+
+def _load(run: Run, missing: list[str]) -> tuple[meshes.Mesh | None, Any]:
+    """Source and style of a run's record, None where they can't be had as they were."""
+    from omegaconf import OmegaConf
+
+    from styleexp import compose, sources
+
+    if not run.record.get("config"):
+        missing.append("Source and style can't be shown: there is no readable run.json.")
+        return None, None
+    compose.register()
+    try:
+        config = compose.typed(OmegaConf.create(run.record["config"]))
+        now = sources.describe(config)
+    except Exception as error:
+        missing.append(f"Source and style can't be shown: {error}")
+        return None, None
+    then = run.record.get("assets") or {}
+    loaders: dict[str, Any] = {
+        "source": lambda: sources.load_source(config.source),
+        "style": lambda: sources.load_style(config.style),
+    }
+    found: dict[str, Any] = {}
+    for kind, load in loaders.items():
+        if kind in then and then[kind].get("sha256") != now[kind]["sha256"]:
+            missing.append(f"The {kind} can't be shown: its file has changed since the run.")
+            continue
+        try:
+            found[kind] = load()
+        except UserError as error:
+            missing.append(f"The {kind} can't be shown: {error}")
+    return found.get("source"), found.get("style")
+
+
+def _style(style: meshes.Mesh | np.ndarray) -> Shape | np.ndarray:
+    if isinstance(style, meshes.Mesh):
+        frame = meshes.normalisation(style.vertices)
+        return Shape(frame.apply(style.vertices), style.faces)
+    return style

@@ -1,0 +1,95 @@
+"""The user study's page (Sec. 4.4): every pair is shown turning and rated from 1 to 5.
+
+It is one file without a server: answers stay in the participant's browser until they are saved as a
+file of theirs, which `styleexp.reports.study_results` reads.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from styleexp.errors import UserError
+from styleexp.reports import folders, html
+from styleexp.reports import shown as shows
+from styleexp.reports.folders import Run
+from styleexp.reports.page import STYLE_PIXELS
+
+NAME = "study.html"
+SCHEMA = "styleexp-study-1"
+QUESTION = "How well does the result match the target style?"
+"""After the paper: "rate how well the style transfer results matched the target style"."""
+LOWEST, HIGHEST = "not a match", "perfect"
+"""What 1 and 5 mean, in the paper's words."""
+
+
+def write(folder: Path, seed: int = 0, title: str = "Rating of stylised meshes") -> Path:
+    """Write ``study.html`` of every finished run below ``folder``; returns its path.
+
+    ``seed`` enters into the order in which each participant sees the pairs. Raises `UserError`
+    where no pair can be shown, and where one of them can't be shown whole: participants could not
+    judge it.
+    """
+    runs = [run for run in folders.find(folder) if run.state == "done"]
+    if not runs:
+        raise UserError(f"there is no finished run below '{folder}' to be rated.")
+    blocks: dict[str, str] = {}
+    pairs = [_pair(run, folder, blocks) for run in runs]
+    study = {
+        "schema": SCHEMA,
+        "study": _identity([(pair["id"], pair["result"]["block"]) for pair in pairs]),
+        "title": title,
+        "seed": seed,
+        "pairs": _distinct(pairs),
+    }
+    text = html.render(
+        "study.html",
+        ["viewers.js", "study.js"],
+        study=study,
+        question=QUESTION,
+        lowest=LOWEST,
+        highest=HIGHEST,
+        blocks=blocks,
+        viewer=html.viewer(),
+    )
+    return html.save(folder / NAME, text)
+
+
+def _pair(run: Run, folder: Path, blocks: dict[str, str]) -> dict[str, Any]:
+    """A pair's names and the keys of its blocks, which are added to ``blocks`` once each."""
+    shown = shows.read(run)
+    if shown.missing:
+        raise UserError(
+            f"the run '{run.folder}' can't be rated: {shown.missing[0]} Mend it, or give a folder "
+            "without it."
+        )
+    below = run.folder.relative_to(folder).as_posix()
+    pair: dict[str, Any] = {"id": below, "label": f"{run.part('source')}-{run.part('style')}"}
+    for kind, content in shown.files(bare=True).items():
+        pair[kind] = {"block": _identity(content)}
+        blocks.setdefault(f"glb-{pair[kind]['block']}", html.packed(content))
+    if isinstance(shown.style, np.ndarray):
+        from PIL import Image
+
+        pixels = Image.fromarray((shown.style * 255).round().astype(np.uint8))
+        pair["style"] = {"picture": html.data_uri(pixels, STYLE_PIXELS, "JPEG")}
+    return pair
+
+
+def _distinct(pairs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Pairs of one source and style get their folders' names, too."""
+    labels = [pair["label"] for pair in pairs]
+    return [
+        pair | {"label": f"{pair['label']} ({pair['id']})"}
+        if labels.count(pair["label"]) > 1
+        else pair
+        for pair in pairs
+    ]
+
+
+def _identity(content: object) -> str:
+    raw = content if isinstance(content, bytes) else repr(content).encode()
+    return hashlib.sha256(raw).hexdigest()[:12]
