@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 LAYERS = ("conv3_1", "conv4_1")
 """Shallower layers took scales for other styles on the truth board; conv5_1 has only six cells on a
 window's side."""
+RIM = 3
+"""Cells at a window's border that see the zeros beyond it, at each of these layers."""
 STYLE_WINDOWS = 48
 HEIGHT_GAIN = 5.0
 """Grey levels per window width of height: a relief of a tenth of the window fills the range."""
@@ -172,7 +174,7 @@ def relief_distance(result: Looks, style: Looks) -> float | None:
 def grams(
     encoder: Encoder, grey: Float[Tensor, "n size size"], mask: Bool[Tensor, "n size size"]
 ) -> Grams:
-    """One Gram for each of ``LAYERS``, over the masked cells alone."""
+    """One Gram for each of ``LAYERS``, over the masked cells alone that see nothing but window."""
     sums: list[Tensor] = []
     counts = [0.0] * len(LAYERS)
     for at in range(0, max(len(grey), 1), 16):
@@ -181,6 +183,7 @@ def grams(
         for k, layer in enumerate(LAYERS):
             found = features[layer].float()
             keep = layer_mask(cover, (found.shape[2], found.shape[3]), erosion=0)
+            keep = functional.pad(keep[:, RIM:-RIM, RIM:-RIM], (RIM, RIM, RIM, RIM))
             cells = float(keep.sum())
             gram = gram_matrix(found, keep) * cells
             if len(sums) <= k:
