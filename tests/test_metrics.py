@@ -259,3 +259,40 @@ def test_the_verdict_tells_a_good_metric_from_a_bad_one(source):
     verdict = truth._verdict(lambda *rest: 1.0 - good(*rest), board)
     assert not verdict["kept"]
     assert verdict["confusions"] == ["torus: right taken for wrong"]
+
+
+@pytest.fixture(scope="module")
+def board(tmp_path_factory):
+    """Two finished runs and one that failed."""
+    from styleexp.cli.run import run
+
+    folder = tmp_path_factory.mktemp("board")
+    for name in ("bubble", "stripe"):
+        overrides = ["source=torus", f"style={name}", "profile=smoke", "encoder=vgg19_random"]
+        assert run(compose([*overrides, "report=false"]), folder / name, overrides) == 0
+    (folder / "failed").mkdir()
+    (folder / "failed" / "run.json").write_text((folder / "bubble" / "run.json").read_text())
+    (folder / "failed" / "status.json").write_text('{"status": "failed"}')
+    return folder
+
+
+def test_a_board_is_measured_anew_and_says_which_runs_are_not_done(board, capsys):
+    measured = board / "bubble" / "metrics.json"
+    measured.write_text("{}")
+    command = ["board", str(board), "--judge", "vgg19_random", "--windows", "4", "--write"]
+    assert main([*command, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["of"] == found["styles"] == 2
+    assert 0 <= found["identification"] <= 2
+    assert found["min_silhouette_iou"] > 0.9
+    assert "failed, not done" in next(r for r in found["runs"] if r["run"] == "failed")["status"]
+    assert "style_distance" in json.loads(measured.read_text())
+    assert main(command) == 0
+    assert "told apart" in capsys.readouterr().out
+
+
+def test_a_run_measured_from_its_file_is_as_it_was_measured_when_it_ended(board, capsys):
+    assert main(["run", str(board / "stripe"), "--judge", "none", "--json"]) == 0
+    again = json.loads(capsys.readouterr().out)
+    logged = json.loads((board / "stripe" / "metrics.json").read_text())
+    assert {k: logged[k] for k in again} == pytest.approx(again, rel=0.01, abs=1e-4)
