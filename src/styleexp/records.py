@@ -162,7 +162,9 @@ class RunFolder:
 
 def essence(config: Mapping[str, Any]) -> Any:
     """A run's configuration as plain JSON, without what changes its speed alone."""
-    kept = {key: value for key, value in config.items() if key not in ("threads", "debug")}
+    kept = {
+        key: value for key, value in config.items() if key not in ("threads", "debug", "report")
+    }
     return json.loads(json.dumps(kept, default=str))
 
 

@@ -12,7 +12,7 @@ from styleexp import meshes, records
 from styleexp.errors import UserError
 from styleexp.metrics import Judge, measure
 from styleexp.metrics.patches import relief_of_result
-from styleexp.metrics.style import Looks, appearance_distance
+from styleexp.metrics.style import Looks, pattern_distance
 from styleexp.scene import pattern_unit
 from styleexp.sources import load_source, load_style
 
@@ -35,7 +35,8 @@ def measure_board(folder: Path, judge: Judge, write: bool = False) -> dict[str, 
     With ``write`` each run's ``metrics.json`` is replaced by what was measured now.
 
     ``identification`` counts the runs whose result looks nearest to their own style among all
-    styles of the board, ``of`` how many were done; runs that weren't are listed as such.
+    styles of the board of its kind, meshes or pictures, which are compared differently; ``of`` is
+    how many runs were done. Those that weren't are listed as such.
     """
     rows: list[dict[str, Any]] = []
     results: list[tuple[dict[str, Any], Looks]] = []
@@ -62,7 +63,12 @@ def measure_board(folder: Path, judge: Judge, write: bool = False) -> dict[str, 
         relief = relief_of_result(source, vertices, faces, unit)
         results.append((row, judge.looks(config, relief, unit)))
     for row, looks in results:
-        far = {name: appearance_distance(looks, goal) for name, goal in goals.items()}
+        own = goals[row["style"]]
+        far = {
+            name: pattern_distance(looks, goal)
+            for name, goal in goals.items()
+            if (goal.height is None) == (own.height is None)
+        }
         row["looks_like"] = min(far, key=lambda name: far[name])
     done = [row for row, _ in results]
     return {

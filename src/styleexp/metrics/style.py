@@ -125,14 +125,18 @@ def style_distance(result: Looks, style: Looks, plain: Looks) -> float:
     Distance of the correlations of features of height images, over that of the plain surface. A
     picture has no heights: against one it is `appearance_distance`, over the plain surface's.
     """
-    if style.height is None or result.height is None or plain.height is None:
-        return appearance_distance(result, style) / appearance_distance(plain, style)
-    return _apart(result.height, style.height) / _apart(plain.height, style.height)
+    return pattern_distance(result, style) / pattern_distance(plain, style)
+
+
+def pattern_distance(result: Looks, style: Looks) -> float:
+    """What `style_distance` is a ratio of."""
+    if style.height is None or result.height is None:
+        return appearance_distance(result, style)
+    return _apart(result.height, style.height)
 
 
 def appearance_distance(result: Looks, style: Looks) -> float:
-    """Distance of the correlations of features of shaded windows: tells styles apart, meshes and
-    pictures alike; not comparable from one style to another."""
+    """Distance of the correlations of features of shaded windows."""
     return _apart(result.shaded, style.shaded)
 
 
