@@ -244,6 +244,15 @@ def test_shell_completion_knows_the_choices(tmp_path):
     assert "style=bubble" in done.stdout
 
 
+def test_overrides_may_stand_on_both_sides_of_the_multirun_flag(tmp_path):
+    done = command(
+        "+experiment=sigma_ablation", "-m", "profile=smoke", "encoder=vgg19_random",
+        "field.sigma=2", "preview.resolution=48", "hydra.sweep.dir=all", cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "all" / "0" / "status.json").read_text())["status"] == "done"
+
+
 def test_several_values_are_a_sweep_and_a_failed_job_does_not_stop_the_rest(tmp_path):
     done = command(
         "-m", "source=torus", "style.path=none.obj,there.ply", *SMOKE, "hydra.sweep.dir=all",

@@ -18,6 +18,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 DEBUG = "debug=true"
+MODES = ("-m", "--multirun", "-r", "--run")
 UNKNOWN_CHOICE = r"Could not find '([\w/]+)/([^'/]+)'"
 """Hydra's words for a name that it has no option for."""
 HYDRA_PLUGINS = {"hydra/launcher": "sweep", "hydra/sweeper": "search"}
@@ -29,6 +30,9 @@ def main() -> None:
     from styleexp.errors import UserError
 
     warnings.showwarning = _show_warning  # type: ignore[assignment]
+    # Hydra's parser refuses overrides on both sides of a flag: `+experiment=x -m profile=fast`.
+    flags = [a for a in sys.argv[1:] if a in MODES]
+    sys.argv[1:] = flags + [a for a in sys.argv[1:] if a not in MODES]
     try:
         resume = [a for a in sys.argv[1:] if a.startswith("resume=")]
         if resume:
