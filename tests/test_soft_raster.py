@@ -104,10 +104,10 @@ def test_gradcheck_smooth_light() -> None:
     normals = (_random(3, 5, seed=1) + 0.2).requires_grad_()
     corners = torch.tensor([[0, 1, 2, 0], [1, 2, 3, 4], [2, 4, 0, 3]])
     view = torch.tensor([0, 1, 1, 0])
-    center, light = _random(2, 4, seed=2), _random(3, 4, seed=3)
+    center, lights = _random(2, 4, seed=2), _random(2, 3, 4, seed=3)
 
     def intensity(points: Tensor, normals: Tensor) -> Tensor:
-        return InterpolateAndLight.apply(points, normals, corners, view, center, light, 0.4, 0.9)
+        return InterpolateAndLight.apply(points, normals, corners, view, center, lights, 0.4, 0.9)
 
     assert ((intensity(points, normals) > 0) & (intensity(points, normals) < 1)).all()
     assert gradcheck(intensity, (points, normals))

@@ -132,6 +132,10 @@ class ShadingConfig:
     outlines: bool = False
     """Whether outlines carry gradients, where the renderer can. Off in the paper; where they do,
     the optimiser grows knobs to make outlines inside the frame."""
+    lights: int = 3
+    """1: a grey picture under one light, as in the paper. 3: besides, the same light turned by 120
+    and 240 degrees about the viewing axis, each in a colour of its own: the colour then tells the
+    normal, and bumps from dents. A picture as style is compared in grey in any case."""
     light_spread: float = 0.0
     """Largest angle, in degrees, by which the light is turned at random about the viewing axis, for
     every view anew; 0 fixes it in camera space. At 180 bumps can't be told from dents."""
@@ -264,6 +268,7 @@ CHOICES = {
     "views.local.mode": ("image", "zoom", "surface"),
     "views.local.crop": ("side", "area"),
     "shading.normals": ("flat", "smooth"),
+    "shading.lights": (1, 3),
     "encoder.precision": ("auto", "fp32", "bf16"),
     "encoder.pooling": ("max", "avg"),
     "encoder.normalisation": ("weights", "paper"),

@@ -113,11 +113,12 @@ def prepare(config: Config) -> Scene:
     shading = choose_shading(config, grey)
     encoder = build("encoder", config.encoder, device=device, seed=config.optim.seed)
     loss = build("loss", config.loss, encoder=encoder)
-    viewer = Viewer(config, renderer, shading, surface)
+    lights = config.shading.lights if isinstance(style, meshes.Mesh) else 1
+    viewer = Viewer(config, renderer, shading, surface, lights=lights)
     target: StyleTarget
     if isinstance(style, meshes.Mesh):
         _, styled = normalised(style, device)
-        style_viewer = Viewer(config, renderer, shading, styled, unit)
+        style_viewer = Viewer(config, renderer, shading, styled, unit, lights)
         if config.loss.target != "bank":
             target = styles.SameViewsTarget(loss, style_viewer, styled.vertices)
         else:

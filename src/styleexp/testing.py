@@ -288,6 +288,32 @@ def light_moves_with_the_camera(renderer: Renderer) -> None:
         assert torch.allclose(out.image[view, 0, 0, 0], torch.tensor(0.8), atol=1e-3)
 
 
+def several_lights_are_several_pictures(renderer: Renderer) -> None:
+    """`Renderer.render_lights`: each light's channel, and its gradient, is `render`'s."""
+    vertices, faces = bumpy_sphere(1)
+    cameras = _cameras(2, spread=0.2)
+    lights = torch.tensor([[0.5, 0.2, 0.4], [0.0, -0.4, 0.6], [-0.6, 0.1, 0.5]])
+    lights = lights[:, None].expand(3, 2, 3)
+    for normals in ("flat", "smooth"):
+        shading = Shading(normals=normals, background=0.3)
+        together, apart = vertices.clone().requires_grad_(), vertices.clone().requires_grad_()
+        resolution = (48, 48)
+        out = renderer.render_lights(together, faces, cameras, shading, lights, resolution)
+        assert out.image.shape == (2, 48, 48, 3)
+        weights = torch.linspace(0, 1, out.image.numel()).view_as(out.image).sin()
+        (out.image * weights).sum().backward()
+        for i, light in enumerate(lights):
+            one = renderer.render(apart, faces, cameras, replace(shading, light=light), resolution)
+            channel = one.image[..., min(i, one.image.shape[-1] - 1)]
+            assert torch.allclose(out.image[..., i], channel, atol=1e-5)
+            (channel * weights[..., i]).sum().backward()
+        if renderer.capabilities.differentiable_shading:
+            assert together.grad is not None
+            assert apart.grad is not None
+            error = (together.grad - apart.grad).norm()
+            assert error < 1e-3 * apart.grad.norm()
+
+
 # Invariance and odd input
 
 
@@ -499,6 +525,7 @@ CHECKS: tuple[Check, ...] = (
     depth_on_receding_quad,
     smooth_normals_are_perspective_correct,
     light_moves_with_the_camera,
+    several_lights_are_several_pictures,
     everything_behind_the_camera,
     degenerate_faces,
     camera_inside_the_mesh,

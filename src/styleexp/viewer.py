@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
@@ -34,7 +33,8 @@ class Viewer:
     """Renders a mesh's views for any step; equal seeds see equal views.
 
     ``scale`` enlarges what is seen: the style mesh is shown larger to make its pattern come out
-    larger on the result.
+    larger on the result. Images have a channel for each of the ``lights``, which stand evenly
+    about the viewing axis; the first is that of ``shading``.
     """
 
     def __init__(
@@ -44,12 +44,14 @@ class Viewer:
         shading: Shading,
         surface: Surface,
         scale: float = 1.0,
+        lights: int = 1,
     ):
         self.config = config.views
         self.light_spread = config.shading.light_spread
         self.seed = config.optim.seed
         self.renderer = renderer
         self.shading = shading
+        self.lights = lights
         self.faces = surface.faces
         self.scale = scale
         self.surface_cameras: Cameras | None = None
@@ -101,11 +103,15 @@ class Viewer:
         size: int,
         generator: torch.Generator,
     ) -> Images:
-        shading = self.shading
+        turn = torch.zeros(len(cameras))
         if self.light_spread > 0:
-            light = turned_light(shading, self.light_spread, len(cameras), generator)
-            shading = replace(shading, light=light)
-        out = self.renderer.render(vertices, self.faces, cameras, shading, (size, size))
+            turn = self.light_spread * (2 * torch.rand(len(cameras), generator=generator) - 1)
+        lights = torch.stack(
+            [turned_light(self.shading, turn + 360 * i / self.lights) for i in range(self.lights)]
+        )
+        out = self.renderer.render_lights(
+            vertices, self.faces, cameras, self.shading, lights, (size, size)
+        )
         return Images(out.image, out.coverage)
 
     def _perspective(self, seen: Images, generator: torch.Generator) -> Images:
@@ -120,11 +126,9 @@ class Viewer:
         return Images(both[..., :-1], both[..., -1] - self.config.perspective_fill)
 
 
-def turned_light(
-    shading: Shading, spread: float, count: int, generator: torch.Generator
-) -> Float[Tensor, "views 3"]:
-    """The light turned about the viewing axis, for each view by up to ``spread`` degrees."""
+def turned_light(shading: Shading, degrees: Float[Tensor, " views"]) -> Float[Tensor, "views 3"]:
+    """The light turned about the viewing axis, for each view by its own angle."""
     x, y, z = torch.as_tensor(shading.light, dtype=torch.float32)
-    angle = math.radians(spread) * (2 * torch.rand(count, generator=generator) - 1)
+    angle = degrees.deg2rad()
     cos, sin = angle.cos(), angle.sin()
-    return torch.stack([x * cos - y * sin, x * sin + y * cos, z.expand(count)], dim=1)
+    return torch.stack([x * cos - y * sin, x * sin + y * cos, z.expand(len(degrees))], dim=1)

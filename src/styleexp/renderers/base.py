@@ -20,8 +20,10 @@ front of the camera. Faces wind counter-clockwise seen from outside; back faces 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
+
+import torch
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -121,3 +123,25 @@ class Renderer(ABC):
         ``resolution`` is (height, width) in pixels. Gradients flow from ``image`` (and, with
         visibility gradients, ``coverage``) to ``vertices``. An empty mesh gives the background.
         """
+
+    def render_lights(
+        self,
+        vertices: Float[Tensor, "vertices 3"],
+        faces: Int[Tensor, "faces 3"],
+        cameras: Cameras,
+        shading: Shading,
+        lights: Float[Tensor, "lights views 3"],
+        resolution: tuple[int, int],
+    ) -> RenderOutput:
+        """The same picture under several lights: each is seen in a channel of its own.
+
+        ``lights`` stand where ``shading.light`` does in `render`. This renders once for each; a
+        backend may share what doesn't depend on the light.
+        """
+        outs = [
+            self.render(vertices, faces, cameras, replace(shading, light=light), resolution)
+            for light in lights
+        ]
+        # Of a backend with colours, each light takes its own: red, green, blue.
+        channels = [out.image[..., min(i, out.image.shape[-1] - 1)] for i, out in enumerate(outs)]
+        return replace(outs[0], image=torch.stack(channels, dim=-1))

@@ -101,7 +101,8 @@ class MitsubaAD(Renderer):
         with torch.no_grad():
             eyes = _eyes(cameras, single)
             front = facing(single, corners, face_normals, eyes)
-            light = world_light(cameras, shading, single)
+            light = torch.as_tensor(shading.light).expand(len(cameras), 3)
+            light = world_light(cameras, light, single)
         job = _Job(faces.int(), front, eyes, cameras, light, shading, resolution)
         if not bool(front.any()):
             return job.nothing(vertices.dtype)

@@ -85,6 +85,19 @@ class DeferredRenderer(Renderer):
         resolution: tuple[int, int],
     ) -> RenderOutput:
         """Render one mesh from every camera; see ``Renderer.render``."""
+        light = torch.as_tensor(shading.light).to(vertices).expand(1, len(cameras), 3)
+        return self.render_lights(vertices, faces, cameras, shading, light, resolution)
+
+    def render_lights(
+        self,
+        vertices: Float[Tensor, "vertices 3"],
+        faces: Int[Tensor, "faces 3"],
+        cameras: Cameras,
+        shading: Shading,
+        lights: Float[Tensor, "lights views 3"],
+        resolution: tuple[int, int],
+    ) -> RenderOutput:
+        """All lights on what is found to be seen once; see ``Renderer.render_lights``."""
         if shading.normals not in ("flat", "smooth"):
             raise unknown_name("kind of normals", shading.normals, ("flat", "smooth"))
         corners = faces.t().contiguous().long()
@@ -99,15 +112,15 @@ class DeferredRenderer(Renderer):
                 Projected(points.detach(), corners, pairs, cameras.near, resolution)
             )
 
-        light = world_light(cameras, shading, vertices)
+        light = world_light(cameras, lights, vertices)
         surface: FlatSurface | SmoothSurface
         if shading.normals == "flat":
             surface = FlatSurface(face_normals, light, shading)
         else:
             surface = SmoothSurface(points, face_normals, corners, light, shading)
         intensities = surface.at_pixels(visible)
-        background = vertices.new_full((visible.depth.numel(),), shading.background)
-        image = background.index_copy(0, visible.pixel, intensities)
+        background = vertices.new_full((len(lights), visible.depth.numel()), shading.background)
+        image = background.index_copy(1, visible.pixel, intensities)
         coverage = (visible.face_ids >= 0).to(vertices.dtype).view(-1)
 
         if self.visibility_gradient == "contour" and shading.outlines:
@@ -115,17 +128,21 @@ class DeferredRenderer(Renderer):
             edges = find_crossings(points, corners, across, front, pairs, visible, cameras.near)
             distance = CrossingDistance.apply(points, edges)
             colour = surface.at_crossings(edges)
-            image, coverage = Blend.apply(
-                torch.stack([image, coverage]),
+            blended = Blend.apply(
+                torch.cat([image, coverage[None]]),
                 distance,
-                torch.stack([colour, torch.ones_like(colour)]),
+                torch.cat([colour, torch.ones_like(colour[:1])]),
                 edges.inner,
                 edges.outer,
             )
+            image, coverage = blended[:-1], blended[-1]
 
         shape = visible.depth.shape
         return RenderOutput(
-            image.view(*shape, 1), coverage.view(shape), visible.face_ids, visible.depth
+            image.view(len(lights), *shape).permute(1, 2, 3, 0),
+            coverage.view(shape),
+            visible.face_ids,
+            visible.depth,
         )
 
     def _neighbours(self, faces: Tensor, count: int) -> Int[Tensor, "3 faces"]:

@@ -20,10 +20,11 @@ if TYPE_CHECKING:
     from styleexp.renderers.soft_raster.raster import Visible
 
 
-def world_light(cameras: Cameras, shading: Shading, like: Tensor) -> Float[Tensor, "views 3"]:
-    """Each view's light, direction times strength, in world coordinates."""
-    light = torch.as_tensor(shading.light).detach().to(like).expand(len(cameras), 3)
-    return (light[:, :, None] * cameras.rotation.detach().to(like)).sum(1)
+def world_light(
+    cameras: Cameras, lights: Float[Tensor, "*lights views 3"], like: Tensor
+) -> Float[Tensor, "*lights views 3"]:
+    """Each view's light or lights, direction times strength, in world coordinates."""
+    return (lights.detach().to(like)[..., None] * cameras.rotation.detach().to(like)).sum(-2)
 
 
 class FlatSurface:
@@ -32,18 +33,19 @@ class FlatSurface:
     def __init__(
         self,
         face_normals: Float[Tensor, "3 faces"],
-        light: Float[Tensor, "views 3"],
+        light: Float[Tensor, "lights views 3"],
         shading: Shading,
     ) -> None:
         self.normals, self.light, self.shading = unit(face_normals), light, shading
 
-    def at_pixels(self, visible: Visible) -> Float[Tensor, " winners"]:
+    def at_pixels(self, visible: Visible) -> Float[Tensor, "lights winners"]:
         """Intensities of the covered pixels."""
         lit = self.light @ self.normals
         intensity = (self.shading.albedo * (self.shading.ambient + lit)).clamp(0, 1)
-        return PickOne.apply(intensity, visible.view * intensity.shape[1] + visible.face)
+        index = visible.view * intensity.shape[2] + visible.face
+        return torch.stack([PickOne.apply(one, index) for one in intensity])
 
-    def at_crossings(self, crossings: Crossings) -> Float[Tensor, " n"]:
+    def at_crossings(self, crossings: Crossings) -> Float[Tensor, "lights n"]:
         """Intensities right at outlines; without gradients."""
         normal = self.normals.detach().index_select(1, crossings.face)
         return _lit(normal, crossings.view, self.light, self.shading)
@@ -57,13 +59,13 @@ class SmoothSurface:
         points: Float[Tensor, "3 views vertices"],
         face_normals: Float[Tensor, "3 faces"],
         corners: Int[Tensor, "3 faces"],
-        light: Float[Tensor, "views 3"],
+        light: Float[Tensor, "lights views 3"],
         shading: Shading,
     ) -> None:
         self.points, self.corners, self.light, self.shading = points, corners, light, shading
         self.normals = vertex_normals(face_normals, corners, points.shape[2])
 
-    def at_pixels(self, visible: Visible) -> Float[Tensor, " winners"]:
+    def at_pixels(self, visible: Visible) -> Float[Tensor, "lights winners"]:
         """Intensities of the covered pixels."""
         height, width = visible.face_ids.shape[1:]
         within = visible.pixel - visible.view * (height * width)
@@ -75,12 +77,12 @@ class SmoothSurface:
             self.corners.index_select(1, visible.face),
             visible.view,
             torch.stack([column, row]).to(self.points.dtype) + 0.5,
-            self.light.index_select(0, visible.view).t(),
+            self.light.index_select(1, visible.view).transpose(1, 2),
             self.shading.albedo,
             self.shading.ambient,
         )
 
-    def at_crossings(self, crossings: Crossings) -> Float[Tensor, " n"]:
+    def at_crossings(self, crossings: Crossings) -> Float[Tensor, "lights n"]:
         """Intensities right at outlines; without gradients."""
         flat, normals = self.points.detach().reshape(3, -1), self.normals.detach()
         first = crossings.view * self.points.shape[2]
@@ -99,7 +101,7 @@ class SmoothSurface:
 
 
 def _lit(normal: Tensor, view: Tensor, light: Tensor, shading: Shading) -> Tensor:
-    lit = (normal * light.index_select(0, view).t()).sum(0)
+    lit = (normal * light.index_select(1, view).transpose(1, 2)).sum(1)
     return (shading.albedo * (shading.ambient + lit)).clamp(0, 1)
 
 
@@ -126,8 +128,8 @@ class InterpolateAndLight(torch.autograd.Function):
     """Interpolate vertex normals at pixels and light them, in one step.
 
     The arguments are the homogeneous pixels (3, views, V) and unit normals (3, V) of the vertices,
-    then, of n pixels, the three vertices (3, n), the view (n), the centre (2, n) and the light
-    (3, n), and the two constants of the shading. Returns the intensities (n).
+    then, of n pixels, the three vertices (3, n), the view (n), the centre (2, n) and the lights
+    (lights, 3, n), and the two constants of the shading. Returns the intensities (lights, n).
 
     The weight of a vertex is the cross product of the other two vertices' offsets from the pixel's
     ray, ``(x w - column w, y w - row w)``. That is the perspective-correct barycentric coordinate
@@ -165,7 +167,7 @@ class InterpolateAndLight(torch.autograd.Function):
         squared = (normal * normal).sum(0)
         inverse = torch.where(squared > 0, squared, 1.0).rsqrt()
         normal *= inverse
-        lit = (normal * light).sum(0)
+        lit = (normal * light).sum(1)
         raw = albedo * (ambient + lit)
         unclamped = (raw >= 0) & (raw <= 1)
         ctx.save_for_backward(
@@ -190,7 +192,10 @@ class InterpolateAndLight(torch.autograd.Function):
         corners, view, center, light, normal, lit, scale, *rest = ctx.saved_tensors
         weights, right, down, corner_normals = rest[:3], rest[3:6], rest[6:9], rest[9:]
         points_shape, normals_shape = ctx.shapes
-        to_normal = torch.addcmul(light, normal, lit, value=-1).mul_(grad * scale)
+        # Along the normal itself there is no change: normalising removes it.
+        towards = grad * scale
+        to_normal = (light * towards[:, None]).sum(0)
+        to_normal.addcmul_(normal, (lit * towards).sum(0), value=-1)
         to_normals = grad.new_zeros(normals_shape)
         to_points = grad.new_zeros(points_shape)
         flat = to_points.view(3, -1)
