@@ -69,8 +69,9 @@ class FieldConfig:
     depth: int = 8
     """Fully connected layers, the output layer included."""
     bound: float | None = None
-    """Displacements lie in (-bound, bound), in radii; see ``style.scale_by``. null: twice
-    what the style mesh's own relief needs, 0.05 for a picture. The paper has 0.1."""
+    """Displacements lie in (-bound, bound), in radii; see ``style.scale_by``. null: twice what the
+    style mesh's own relief needs; of a picture, which doesn't tell its height, twice 0.15 of its
+    wavelength. The paper has 0.1."""
     zero_mean: bool = True
     """Subtract the area-weighted mean displacement, so that the mesh can't shrink as a whole."""
 

@@ -37,8 +37,9 @@ if TYPE_CHECKING:
 BOUND_MARGIN = 2.0
 """How much farther than the style's own relief the displacement may reach."""
 
-PICTURE_RELIEF = 0.05
-"""Half the range of a picture's relief, and its bound, in radii: a picture doesn't tell them."""
+PICTURE_STEEPNESS = 0.15
+"""Half the range of a picture's relief, in its own wavelengths: a picture doesn't tell its height.
+Of the analytic styles it is 0.10 to 0.16."""
 
 PICTURE_DETAIL = 128
 """Pixels on a picture's longer side when its frequency is measured; finer detail doesn't count."""
@@ -162,13 +163,12 @@ def choose_field(
         relief = mesh_relief(vertices, style.faces, normals, length=0.5)
         frequency = mesh_frequency(relief, vertices, style.faces)
         height = min(max(half_range(relief), 0.005), 0.05)
-        reach = BOUND_MARGIN * height
     else:
         small = styles.resized(torch.from_numpy(style).mean(-1), PICTURE_DETAIL)
         frequency = picture_frequency(small.numpy()) / math.sqrt(4 * math.pi)
-        height = reach = PICTURE_RELIEF
+        height = PICTURE_STEEPNESS / min(max(frequency, 1.0), 10.0)
     sigma = min(max(frequency, 1.0), 10.0) if config.sigma is None else config.sigma
-    bound = reach if config.bound is None else config.bound
+    bound = BOUND_MARGIN * height if config.bound is None else config.bound
     return sigma, bound, height
 
 
