@@ -40,7 +40,7 @@ class StyleConfig:
     """What ``scale`` 1 means. ``area``: the result carries as many features as the style mesh, as
     lengths go by the square root of the surface; ``field.sigma`` and ``field.bound`` then go with
     the pattern, too. ``frame``: both meshes fill the unit sphere, as in the paper."""
-    image_contrast: float | None = 0.12
+    image_contrast: float | None = 0.15
     """Image styles: standard deviation that the picture's tone is brought to (it sets the height of
     the relief); null keeps the picture's own contrast."""
     image_match_mean: bool = True
@@ -182,7 +182,7 @@ class LossConfig:
     mesh is rendered at the result's views in every step, as in the paper. ``whole``: the same, but
     a picture is the target of local views as a whole, too, not in crops, as in Text2Mesh."""
     bank_views: int = 24
-    relief_weight: float = 0.3
+    relief_weight: float = 1.0
     """Weight of mean((d / r)^4), where r is half the range of the style's relief: keeps the
     displacement from flattening out at its bound. Not in the paper."""
 
@@ -192,7 +192,7 @@ class OptimConfig:
     """Adam with a stepped rate (Sec. 4.1)."""
 
     steps: int = 160
-    rate: float = 2e-3
+    rate: float = 4e-3
     schedule: str = "cosine"
     """``step``: the rate is multiplied by ``decay`` every ``decay_every`` steps, as in the paper.
     ``cosine``: it falls to a twentieth over the run, so that the last steps settle."""
