@@ -39,8 +39,18 @@ def test_starts_at_the_source_and_keeps_its_bound():
     field = DisplacementField(FieldConfig(), generator(), 5.0, 0.1)
     encoded = field.encode(torch.rand(50, 3))
     assert (field(encoded) == 0).all()
-    torch.nn.init.constant_(field.last.bias, 1e3)
+    torch.nn.init.normal_(field.last.weight, std=1e3, generator=generator(1))
     assert field(encoded).max().item() == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("zero_mean", [True, False])
+def test_a_drift_of_the_mean_saturates_nothing_where_the_mean_is_taken_off(zero_mean):
+    field = DisplacementField(FieldConfig(zero_mean=zero_mean), generator(), 5.0, 0.1)
+    torch.nn.init.normal_(field.last.weight, std=0.1, generator=generator(1))
+    torch.nn.init.constant_(field.last.bias, 20.0)
+    displacement = field(field.encode(torch.rand(50, 3, generator=generator(2))))
+    saturated = (displacement.abs() > 0.0999).float().mean()
+    assert saturated < 0.1 if zero_mean else saturated == 1
 
 
 def test_paper_sizes():

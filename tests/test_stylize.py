@@ -8,9 +8,10 @@ import torch
 
 import styleexp
 from styleexp.compose import compose
+from styleexp.config import OptimConfig
 from styleexp.errors import UserError
 from styleexp.scene import choose_device, prepare
-from styleexp.stylize import finish, optimise, start
+from styleexp.stylize import finish, learning_rate, optimise, start
 
 SMOKE = ("profile=smoke", "encoder=vgg19_random")
 pytestmark = pytest.mark.filterwarnings("ignore:the encoder 'vgg19_random'")
@@ -40,6 +41,18 @@ def test_same_seed_gives_the_same_mesh_and_another_seed_another():
     assert np.array_equal(one.vertices, two.vertices)
     other = run("source=torus", "style=bubble", "optim.seed=1")[0]
     assert not np.array_equal(one.vertices, other.vertices)
+
+
+def test_the_rate_rises_then_falls_or_goes_down_in_the_papers_steps():
+    cosine = OptimConfig(steps=100, rate=1.0, schedule="cosine")
+    rates = [learning_rate(cosine, step) for step in range(100)]
+    assert rates[0] == pytest.approx(0.1)
+    assert rates.index(max(rates)) == 9
+    assert all(a > b for a, b in zip(rates[9:], rates[10:], strict=False))
+    assert rates[-1] == pytest.approx(0.05, abs=0.005)
+    paper = OptimConfig(steps=1000, rate=5e-4, schedule="step", decay=0.9, decay_every=100)
+    assert learning_rate(paper, 99) == 5e-4
+    assert learning_rate(paper, 250) == pytest.approx(5e-4 * 0.81)
 
 
 def test_strength_zero_gives_the_source_back_exactly():

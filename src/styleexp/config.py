@@ -195,7 +195,8 @@ class OptimConfig:
     rate: float = 4e-3
     schedule: str = "cosine"
     """``step``: the rate is multiplied by ``decay`` every ``decay_every`` steps, as in the paper.
-    ``cosine``: it falls to a twentieth over the run, so that the last steps settle."""
+    ``cosine``: it rises over the first tenth of the run, and falls to a twentieth over all of it,
+    so that the last steps settle."""
     decay: float = 0.9
     decay_every: int = 100
     seed: int = 0

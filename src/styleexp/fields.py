@@ -51,11 +51,16 @@ class DisplacementField(nn.Module):
 
     The last layer starts at zero, so that the generated mesh is the source mesh at step 0.
     ``sigma`` is in cycles per radius of the normalised source, ``bound`` in such radii.
+
+    With ``zero_mean`` the mean over the vertices is taken off before tanh, too: no loss holds it,
+    since the mean displacement is taken off as well, and where it drifts, tanh saturates everywhere
+    and nothing is learned any more.
     """
 
     def __init__(self, config: FieldConfig, generator: torch.Generator, sigma: float, bound: float):
         super().__init__()
         self.bound = bound
+        self.centred = config.zero_mean
         self.encode = FourierFeatures(config.features, sigma, config.include_input, generator)
         sizes = [self.encode.size] + [config.width] * (config.depth - 1) + [1]
         linears = [nn.Linear(a, b) for a, b in itertools.pairwise(sizes)]
@@ -71,7 +76,8 @@ class DisplacementField(nn.Module):
     def forward(
         self, encoded: Float[Tensor, "vertices size"], precision: torch.dtype = torch.float32
     ) -> Float[Tensor, " vertices"]:
-        """Displacement for each row of ``encode(points)``, in radii of the normalised source.
+        """Displacement for each row of ``encode(points)``, all vertices at once, in radii of the
+        normalised source.
 
         Hidden layers run in ``precision``; the last one always in float32, because neighbouring
         displacements differ by less than bfloat16 resolves.
@@ -81,7 +87,8 @@ class DisplacementField(nn.Module):
             assert isinstance(layer, nn.Linear)
             weight, bias = layer.weight.to(precision), layer.bias.to(precision)
             x = torch.relu(nn.functional.linear(x, weight, bias))
-        return self.bound * torch.tanh(self.last(x.float()).squeeze(-1))
+        latent = self.last(x.float()).squeeze(-1)
+        return self.bound * torch.tanh(latent - latent.mean() if self.centred else latent)
 
 
 class VertexField(nn.Module):

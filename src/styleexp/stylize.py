@@ -34,6 +34,11 @@ if TYPE_CHECKING:
     from styleexp.config import Config, OptimConfig
 
 
+WARM_UP = 0.1
+"""Share of the run over which the cosine schedule's rate rises from 0: Adam's first steps are as
+long as any, and their direction is mostly noise."""
+
+
 @dataclass
 class State:
     """All that a step changes: what a checkpoint holds."""
@@ -155,8 +160,9 @@ def learning_rate(optim: OptimConfig, step: int) -> float:
     """The rate of a step: see ``OptimConfig.schedule``."""
     if optim.schedule == "step":
         return optim.rate * optim.decay ** (step // optim.decay_every)
-    progress = 0.5 * (1 + math.cos(math.pi * step / optim.steps))
-    return optim.rate * (0.05 + 0.95 * progress)
+    rising = min(1.0, (step + 1) / (WARM_UP * optim.steps))
+    falling = 0.5 * (1 + math.cos(math.pi * step / optim.steps))
+    return optim.rate * rising * (0.05 + 0.95 * falling)
 
 
 def displace(
