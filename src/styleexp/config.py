@@ -200,6 +200,9 @@ class OptimConfig:
     decay: float = 0.9
     decay_every: int = 100
     seed: int = 0
+    unit_gradient: bool = True
+    """Bring every step's gradient to the same length: otherwise a view that shows only a few cells
+    of a deep layer, whose Grams are mostly chance, throws the field off. Not in the paper."""
     renormalize: bool = False
     """Fit the displaced mesh into the unit sphere in every step, as Text2Mesh does."""
     checkpoint_every: int = 25

@@ -144,6 +144,8 @@ def optimise(scene: Scene, state: State) -> Iterator[Step]:
             )
         state.optimizer.zero_grad()
         total.backward()
+        if optim.unit_gradient:
+            normalise_gradient(state.field)
         state.optimizer.step()
         state.step += 1
         yield Step(
@@ -154,6 +156,13 @@ def optimise(scene: Scene, state: State) -> Iterator[Step]:
             displacement.detach().square().mean().sqrt().item(),
             time.perf_counter() - begun,
         )
+
+
+def normalise_gradient(field: torch.nn.Module) -> None:
+    """Scale the gradient of all parameters together to length 1; zero stays zero."""
+    gradients = [p.grad for p in field.parameters() if p.grad is not None]
+    length = torch.nn.utils.get_total_norm(gradients).clamp(min=1e-30)
+    torch._foreach_div_(gradients, length)
 
 
 def learning_rate(optim: OptimConfig, step: int) -> float:
