@@ -252,6 +252,9 @@ class Config:
     optim: OptimConfig = option(default_factory=OptimConfig)
     preview: PreviewConfig = option(default_factory=PreviewConfig)
     metrics: MetricsConfig = option(default_factory=MetricsConfig)
+    logger: dict[str, Any] = option(default_factory=dict)
+    """Who else is told of the run's numbers and pictures: each logger's own options, by its name.
+    ``logger=tensorboard``, ``logger=mlflow`` or ``'logger=[tensorboard,mlflow]'``."""
     report: bool = True
     """Write ``report.html``, the run's page: about 3 MB and a second for 20 000 faces."""
     strength: float = 1.0
