@@ -40,6 +40,14 @@ EXTERNAL = re.compile(
     r"""[^>]*\bhref=["']?(?:https?:)?//[^"'\s>]*"""
     r"""|@import\s+(?:url\()?["']?(?:https?:)?//[^"')\s]*|url\(["']?(?:https?:)?//[^"')\s]*"""
 )
+API_PAGE = """---
+title: styleexp.{0}
+---
+
+::: styleexp.{0}
+    options:
+      heading_level: 1
+"""
 SHIM = "https://unpkg.com/iframe-worker/shim"
 LINK = re.compile(r"\[([^\]]+)\]\((\.\./[^)#\s]+)(#[^)\s]*)?\)")
 OBJECT = re.compile(r"`(styleexp\.[\w.]+)`")
@@ -53,7 +61,7 @@ def on_files(files, config):
         "reference/api.md": api_index(),
     }
     for modules in API.values():
-        made |= {api_page(name): f"# styleexp.{name}\n\n::: styleexp.{name}\n" for name in modules}
+        made |= {api_page(name): API_PAGE.format(name) for name in modules}
     for uri, content in made.items():
         files.append(File.generated(config, uri, content=content))
     return files
