@@ -267,7 +267,7 @@ class Config:
     """Show tracebacks of user errors."""
 
 
-CHOICES = {
+CHOICES: dict[str, tuple[Any, ...]] = {
     "style.scale_by": ("area", "frame"),
     "views.spread": ("normal", "around"),
     "views.local.mode": ("image", "zoom", "surface"),
@@ -331,7 +331,7 @@ def check(config: Config) -> None:
     """Raise `UserError` for a value that has no meaning, naming its key and what is allowed."""
     for key, allowed in CHOICES.items():
         if _value(config, key) not in allowed:
-            raise unknown_name(f"value for {key}", str(_value(config, key)), allowed)
+            raise unknown_name(f"value for {key}", str(_value(config, key)), map(str, allowed))
     for key in POSITIVE:
         if not _value(config, key) > 0:
             raise UserError(f"{key}={_value(config, key)} is not allowed: give a value above 0.")
