@@ -121,15 +121,28 @@ def test_mlflow_has_parameters_metrics_and_files_in_sqlite(run, tmp_path):
     assert Path(copy).read_bytes() == (run / "result.glb").read_bytes()
 
 
-def test_a_logger_that_breaks_is_dropped_and_the_run_goes_on(tmp_path, monkeypatch):
-    (tmp_path / "lab_logger.py").write_text(LOGGER)
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setenv("STYLEEXP_PLUGINS", "logger=lab_logger:BROKEN")
-    with pytest.warns(UserWarning, match="'broken' stopped .the server is gone.; the run goes on"):
-        assert stylise(tmp_path / "run", "logger=broken") == 0
-    assert [each["step"] for each in steps(tmp_path / "run")] == [1, 2, 3, 4]
-    record = json.loads((tmp_path / "run" / "run.json").read_text())
+@pytest.fixture(scope="module")
+def broken(tmp_path_factory):
+    """A run whose logger broke in the middle."""
+    cwd = tmp_path_factory.mktemp("broken")
+    (cwd / "lab_logger.py").write_text(LOGGER)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(cwd)
+        patch.setenv("STYLEEXP_PLUGINS", "logger=lab_logger:BROKEN")
+        told = "'broken' stopped .the server is gone.; the run goes on"
+        with pytest.warns(UserWarning, match=told):
+            assert stylise(cwd / "run", "logger=broken") == 0
+    return cwd / "run"
+
+
+def test_a_logger_that_breaks_is_dropped_and_the_run_goes_on(broken):
+    assert [each["step"] for each in steps(broken)] == [1, 2, 3, 4]
+    record = json.loads((broken / "run.json").read_text())
     assert [each["name"] for each in record["plugins"]] == ["broken"]
+
+
+def test_results_have_the_same_bits_whoever_listens(run, broken):
+    assert (run / "result.ply").read_bytes() == (broken / "result.ply").read_bytes()
 
 
 @pytest.mark.parametrize("name", ["tensorboard", "mlflow"])
