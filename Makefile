@@ -1,6 +1,7 @@
 # make demo   set up .venv, stylise a mesh on the CPU, say where the result is
 # make test   set up .venv, run every test
 # make lint   ruff and mypy
+# make docs   the documentation, to site/index.html; warnings are errors
 # make conformance   write docs/conformance.md from the checks of every renderer
 # make stress   kill runners and workers of sweeps ten times each, with every local launcher
 # make ray-test   a sweep on a local Ray cluster, in an environment of its own (.venv-ray)
@@ -18,7 +19,7 @@ export OMP_WAIT_POLICY ?= PASSIVE
 # Named meshes and images, where there are some beside the checkout.
 export STYLEEXP_ASSETS ?= $(wildcard $(abspath ../shared))
 
-.PHONY: demo test lint conformance stress ray-test clean
+.PHONY: demo test lint docs conformance stress ray-test clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -32,6 +33,10 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pip check
+
+docs: $(VENV)/.installed-dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo site/index.html
 
 conformance: $(VENV)/.installed-dev
 	$(BIN)/python -m styleexp.testing > docs/conformance.md
@@ -60,5 +65,5 @@ $(VENV)/.installed: pyproject.toml $(wildcard constraints.txt) | $(BIN)/python
 	@touch $@
 
 $(VENV)/.installed-dev: pyproject.toml $(wildcard constraints.txt) | $(BIN)/python
-	$(PIP) --editable '.[dev,all]'
+	$(PIP) --editable '.[dev,docs,all]'
 	@touch $@ $(VENV)/.installed

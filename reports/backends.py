@@ -29,7 +29,7 @@ nb.pictures(runs, "renderer", "seed")
 # %%
 shown = nb.table(runs, ["style_distance", "relief_distance", "relief_rms", "silhouette_iou"])
 nb.save(shown, tables, "backends")
-shown
+nb.show(shown)
 
 # %%
 nb.bars(runs, "renderer", ["style_distance", "relief_rms", "seconds"])

@@ -30,7 +30,7 @@ nb.pictures(runs, "method")
 shown = nb.table(runs, ["style_distance", "relief_distance", "relief_rms", "silhouette_iou",
                         "self_intersections", "spike"])  # fmt: skip
 nb.save(shown, tables, "baselines")
-shown
+nb.show(shown)
 
 # %%
 nb.bars(runs, "method", ["style_distance", "silhouette_iou", "self_intersections"])

@@ -17,14 +17,13 @@ from IPython.display import Image, Markdown
 from styleexp.reports import notebook as nb
 
 runs = nb.runs(folder, "board")
-runs["result"] = "result"
 Markdown(nb.caution(runs))
 
 # %% [markdown]
 # ## The pairs
 
 # %%
-nb.pictures(runs, "result")
+nb.triples(runs)
 
 # %% [markdown]
 # ## The numbers
@@ -34,7 +33,7 @@ shown = nb.table(
     runs, ["style_distance", "relief_distance", "relief_rms", "silhouette_iou", "spike"]
 )
 nb.save(shown, tables, "board")
-shown
+nb.show(shown)
 
 # %% [markdown]
 # ## The ratings

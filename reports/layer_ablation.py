@@ -19,6 +19,7 @@ runs = nb.runs(folder, "layer_ablation")
 runs["layers"] = (
     runs["axis.layers"].str.removesuffix("_vgg16") if "axis.layers" in runs else "mixed"
 )
+runs = runs.sort_values("layers", key=lambda column: column.map(["low", "mixed", "high"].index))
 Markdown(nb.caution(runs))
 
 # %% [markdown]
@@ -35,7 +36,7 @@ shown = nb.table(
     runs, ["style_distance", "relief_distance", "relief_rms", "silhouette_iou", "chamfer"]
 )
 nb.save(shown, tables, "layer_ablation")
-shown
+nb.show(shown)
 
 # %%
 nb.bars(runs, "layers", ["style_distance", "relief_rms", "silhouette_iou"])

@@ -31,7 +31,7 @@ nb.pictures(runs.sort_values("switch"), "switch")
 metrics = ["style_distance", "relief_distance", "relief_rms", "silhouette_iou", "spike"]
 shown = nb.table(runs, metrics)
 nb.save(shown, tables, "method")
-shown
+nb.show(shown)
 
 # %%
 import pandas

@@ -38,7 +38,7 @@ shown = nb.table(runs, ["style_distance", "relief_rms", "silhouette_iou", "spike
 if "fineness" in runs:
     shown["fineness"] = runs["fineness"]
 nb.save(shown, tables, "sigma_ablation")
-shown
+nb.show(shown)
 
 # %%
 nb.bars(runs, "σ", ["relief_rms", "fineness", "style_distance"])

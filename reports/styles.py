@@ -9,8 +9,9 @@ folder = "outputs/paper"
 tables = None  # a folder for the tables as CSV and LaTeX
 
 # %%
-from IPython.display import Markdown
+from IPython.display import Markdown, display
 
+from styleexp.errors import UserError
 from styleexp.reports import notebook as nb
 
 runs = nb.runs(folder, "mesh_styles", "multi_style", "image_styles")
@@ -19,10 +20,19 @@ runs["style"] = runs["pair"].str.split("-", n=1).str[1]
 Markdown(nb.caution(runs))
 
 # %% [markdown]
-# ## The figure
+# ## The figures
 
 # %%
-nb.pictures(runs, "style", "source")
+for number, name in ((2, "mesh_styles"), (3, "multi_style"), (4, "image_styles")):
+    try:
+        part = nb.runs(folder, name)
+    except UserError:
+        continue  # no run of it here
+    part["source"], part["style"] = (
+        part["pair"].str.split("-", n=1).str[0],
+        part["pair"].str.split("-", n=1).str[1],
+    )
+    display(Markdown(f"Fig. {number}, `{name}`:"), nb.pictures(part, "style", "source"))
 
 # %% [markdown]
 # ## The numbers
@@ -32,7 +42,7 @@ shown = nb.table(
     runs, ["style_distance", "relief_distance", "relief_rms", "silhouette_iou", "spike"]
 )
 nb.save(shown, tables, "styles")
-shown
+nb.show(shown)
 
 # %%
 nb.bars(runs, "style", ["style_distance", "silhouette_iou"])

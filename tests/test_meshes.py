@@ -179,6 +179,19 @@ def test_concave_quad_is_cut_inside():
         assert (crosses(turned, faces)[:, 2] > 0).all()
 
 
+def glb_attribute(path, name, mesh=0):
+    """A vertex attribute of floats, read from the file's bytes without trimesh."""
+    content = path.read_bytes()
+    (length,) = struct.unpack("<I", content[12:16])
+    tree, binary = json.loads(content[20 : 20 + length]), content[28 + length :]
+    (primitive,) = tree["meshes"][mesh]["primitives"]
+    accessor = tree["accessors"][primitive["attributes"][name]]
+    assert (accessor["componentType"], accessor["type"]) == (5126, "SCALAR")
+    view = tree["bufferViews"][accessor["bufferView"]]
+    start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+    return np.frombuffer(binary, np.float32, accessor["count"], start)
+
+
 def ply(kind: str, size: int = 3) -> bytes:
     """A strip of triangles or quads, with colours."""
     vertices = [(x, y, 0) for x in range(4) for y in range(2)]
@@ -222,6 +235,7 @@ def test_ply_keeps_order_and_colours(tmp_path, kind, size):
         back = meshes.load_mesh(out)
         assert back.faces.tolist() == mesh.faces.tolist()
         np.testing.assert_array_equal(back.carrier.colors[back.carrier.corners][..., 0], red)
+    assert glb_attribute(tmp_path / "out.glb", "_DISPLACEMENT").tolist() == values.tolist()
     raw = trimesh.load(tmp_path / "out.ply", process=False).metadata["_ply_raw"]["vertex"]["data"]
     assert raw["displacement"].dtype == np.float32
     np.testing.assert_array_equal(raw["displacement"], values)

@@ -12,7 +12,7 @@ from browser import browser, check_quiet, covered, pixels, wait
 
 EVIL = "<img src=x onerror=alert(1)>"
 SMOKE = ["profile=smoke", "encoder=vgg19_random"]
-PARTICIPANTS = 6
+PARTICIPANTS = 20
 
 
 def styleexp(*arguments, cwd):
@@ -252,7 +252,7 @@ def take_part(page, uri, seed, downloads):
 def test_study_is_rated_saved_and_analysed(runs, tmp_path):
     report("study", "board", "--seed", "3", cwd=runs)
     uri = (runs / "board" / "study.html").as_uri()
-    with browser(tmp_path) as page:
+    with browser(tmp_path, width=600, height=700) as page:  # fewer pixels to draw in software
         keep_still(page)
         files = [take_part(page, uri, seed, tmp_path / "downloads") for seed in range(PARTICIPANTS)]
         check_quiet(page)

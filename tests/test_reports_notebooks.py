@@ -199,3 +199,27 @@ def test_notebooks_without_runs_are_left_out_and_a_failure_is_one_sentence(tmp_p
     assert not list((tmp_path / "notebooks").glob("sigma*"))
     assert main([str(tmp_path), "--notebooks", "layers"]) == 2
     assert "did you mean 'layer_ablation'" in capsys.readouterr().err
+
+
+def test_a_plan_of_pairs_half_done_has_one_column_of_pairs(tmp_path):
+    pairs = ("torus_bubble", "sphere_stripe", "hand_wave_large")
+    given = {pair: [f"+pair={pair}", "+experiment=board"] for pair in pairs}
+    for pair in pairs[:2]:
+        write_run(tmp_path / "board" / pair, [*given[pair], *_parts(pair)])
+    jobs = {f"board/{pair}": {"state": "missing", "overrides": given[pair]} for pair in pairs}
+    (tmp_path / "manifest.json").write_text(json.dumps({"schema": 1, "jobs": jobs}))
+    frame = notebook.runs(tmp_path, "board")
+    assert sorted(frame["pair"]) == ["hand-wave_large", "sphere-stripe", "torus-bubble"]
+    table = notebook.table(frame, ["style_distance"])
+    assert len(set(table)) == len(list(table))
+    assert notebook.latex(table).count("torus-bubble") == 1
+    page = notebook.show(table).data
+    assert "0.5</td>" in page
+    assert "–</td>" in page  # of the one that never began
+    assert "<dt>style_distance</dt>" in page
+    assert notebook.triples(frame).data.startswith(b"\x89PNG")
+
+
+def _parts(pair):
+    source, _, style = pair.partition("_")
+    return [f"source={source}", f"style={style}"]

@@ -16,7 +16,8 @@ from styleexp.shapes import SOURCES, STYLES
 
 CONFIG_PATH = "pkg://styleexp.conf"
 PARTS = ("renderer", "encoder", "style", "field", "loss", "baseline")
-"""Keys of the configuration whose options are those of the part that they name."""
+"""Keys of the configuration whose options are those of the part that they name. ``logger`` holds
+several, by their names."""
 
 
 def register() -> None:
@@ -37,6 +38,10 @@ def register() -> None:
         elif choice.kind in PARTS:
             node = choice.spec.config(name=choice.name)
             store.store(group=choice.kind, name=choice.name, node=node)
+        elif choice.kind == "logger":
+            node = choice.spec.config(name=choice.name)
+            package = f"logger.{choice.name}"
+            store.store(group="logger", name=choice.name, node=node, package=package)
     store.store(
         group="hydra/help",
         name="styleexp",
@@ -50,9 +55,11 @@ def typed(config: DictConfig) -> schema.Config:
     plain = OmegaConf.to_container(config, resolve=True)
     assert isinstance(plain, dict)
     parts = {kind: _part(kind, plain.pop(kind, None)) for kind in PARTS}
+    loggers = plain.pop("logger", None) or {}
     built: Any = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema.Config), plain))
     for kind, part in parts.items():
         setattr(built, kind, part)
+    built.logger = {name: _part("logger", options) for name, options in loggers.items()}
     return built
 
 

@@ -255,6 +255,9 @@ class Config:
     optim: OptimConfig = option(default_factory=OptimConfig)
     preview: PreviewConfig = option(default_factory=PreviewConfig)
     metrics: MetricsConfig = option(default_factory=MetricsConfig)
+    logger: dict[str, Any] = option(default_factory=dict)
+    """Who else is told of the run's numbers and pictures: each logger's own options, by its name.
+    ``logger=tensorboard``, ``logger=mlflow`` or ``'logger=[tensorboard,mlflow]'``."""
     report: bool = True
     """Write ``report.html``, the run's page: about 3 MB and a second for 20 000 faces."""
     strength: float = 1.0
@@ -267,7 +270,7 @@ class Config:
     """Show tracebacks of user errors."""
 
 
-CHOICES = {
+CHOICES: dict[str, tuple[Any, ...]] = {
     "style.scale_by": ("area", "frame"),
     "views.spread": ("normal", "around"),
     "views.local.mode": ("image", "zoom", "surface"),
@@ -331,7 +334,7 @@ def check(config: Config) -> None:
     """Raise `UserError` for a value that has no meaning, naming its key and what is allowed."""
     for key, allowed in CHOICES.items():
         if _value(config, key) not in allowed:
-            raise unknown_name(f"value for {key}", str(_value(config, key)), allowed)
+            raise unknown_name(f"value for {key}", str(_value(config, key)), map(str, allowed))
     for key in POSITIVE:
         if not _value(config, key) > 0:
             raise UserError(f"{key}={_value(config, key)} is not allowed: give a value above 0.")

@@ -22,7 +22,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cache, partial
@@ -33,6 +33,7 @@ from styleexp.baselines.specs import BASELINES
 from styleexp.config import EncoderConfig, FieldConfig, LossConfig, StyleConfig
 from styleexp.encoders.specs import ENCODERS
 from styleexp.errors import UserError, unknown_name
+from styleexp.loggers.specs import LOGGERS
 from styleexp.registry import Spec
 from styleexp.renderers.specs import RENDERERS
 
@@ -59,6 +60,7 @@ KINDS = {
     "field": Kind("styleexp.fields", specs.FIELDS, FieldConfig),
     "loss": Kind("styleexp.losses", specs.LOSSES, LossConfig),
     "baseline": Kind("styleexp.baselines", BASELINES),
+    "logger": Kind("styleexp.loggers", LOGGERS),
 }
 
 
@@ -136,13 +138,24 @@ def warn_of_rivals(kind: str, name: str | None) -> None:
 
 def used(config: Any) -> list[dict[str, str | None]]:
     """The plugins that a configuration names, for a run's record."""
+
+    def named(kind: str) -> Iterable[str | None]:
+        part = getattr(config, kind, None)
+        return part if isinstance(part, Mapping) else (getattr(part, "name", None),)
+
     return [
         {"kind": c.kind, "name": c.name, "origin": c.origin, "version": c.version}
         for c in everything()
-        if c.origin != OWN
-        and not c.fault
-        and c.name == getattr(getattr(config, c.kind, None), "name", None)
+        if c.origin != OWN and not c.fault and c.name in named(c.kind)
     ]
+
+
+def usable(kind: str, name: str) -> Choice:
+    """The part of that name; a `UserError` if it can't be used here, a missing package included."""
+    choice = find(kind, name)
+    if choice.reason:
+        raise UserError(f"the {kind} '{name}' can't be used: {choice.reason}.")
+    return choice
 
 
 def build(kind: str, options: Any, **given: Any) -> Any:
@@ -153,9 +166,7 @@ def build(kind: str, options: Any, **given: Any) -> Any:
     name = getattr(options, "name", None)
     if name is None:
         raise UserError(f"no {kind} was chosen: give {kind}=NAME, one of {', '.join(names(kind))}.")
-    choice = find(kind, name)
-    if choice.reason:
-        raise UserError(f"the {kind} '{name}' can't be used: {choice.reason}.")
+    choice = usable(kind, name)
     try:
         return choice.spec.factory(options, **given)
     except UserError:

@@ -10,6 +10,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -40,6 +41,7 @@ FILES = (
     "check.json",
     "metrics.json",
     "report.html",
+    "mlflow.json",
     "run.json",
 )
 """What a run may leave in its folder; the record last, by which it is known as a run's."""
@@ -110,6 +112,7 @@ class RunFolder:
         if (self.path / "run.json").exists():
             for name in FILES:
                 (self.path / name).unlink(missing_ok=True)
+            shutil.rmtree(self.path / "tensorboard", ignore_errors=True)
 
     def append_metrics(self, step: Step) -> None:
         """Add a step's line."""
@@ -161,10 +164,9 @@ class RunFolder:
 
 
 def essence(config: Mapping[str, Any]) -> Any:
-    """A run's configuration as plain JSON, without what changes its speed alone."""
-    kept = {
-        key: value for key, value in config.items() if key not in ("threads", "debug", "report")
-    }
+    """A run's configuration as plain JSON, without what its result doesn't follow from."""
+    aside = ("threads", "debug", "logger", "report")
+    kept = {key: value for key, value in config.items() if key not in aside}
     return json.loads(json.dumps(kept, default=str))
 
 

@@ -20,6 +20,8 @@ class Spec:
     - field: ``factory(options, generator=, sigma=, bound=)``; ``config.FieldConfig`` or a subclass.
     - loss: ``factory(options, encoder=)``; ``config.LossConfig`` or a subclass.
     - baseline: ``factory(options)``; any dataclass. Returns a `baselines.Method`.
+    - logger: ``factory(options, folder=, record=, step=)``; any dataclass. Returns a
+      `loggers.Logger` for the run of that folder, whose ``run.json`` is the record, from that step.
     """
 
     name: str

@@ -15,9 +15,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; plugins that can't be used are part of the answer, not a failure."""
     parser = argparse.ArgumentParser(
         prog="styleexp-plugins",
-        description="Renderers, encoders, styles, fields, losses and baselines, built in or from "
-        "plugins: whose they are, and why they can't be used where they can't. Plugins are found "
-        f"in installed packages and in {plugins.VARIABLE} (KIND=MODULE:SPEC, ...).",
+        description="Renderers, encoders, styles, fields, losses, baselines and loggers, built in "
+        "or from plugins: whose they are, and why they can't be used where they can't. Plugins are "
+        f"found in installed packages and in {plugins.VARIABLE} (KIND=MODULE:SPEC, ...).",
     )
     parser.add_argument("--json", action="store_true", help="as JSON, a list of objects")
     options = parser.parse_args(arguments)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from styleexp.baselines import Method
     from styleexp.config import Config
+    from styleexp.loggers import Loggers
     from styleexp.scene import Subject
     from styleexp.stylize import Result, State, Step
 
@@ -150,8 +151,9 @@ def _fail(folder: records.RunFolder, reason: str) -> None:
 def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resumed: bool) -> int:
     import torch
 
-    from styleexp import assets, baselines, metrics, sources
+    from styleexp import assets, baselines, metrics, plugins, sources
     from styleexp.config import check
+    from styleexp.loggers import Loggers
     from styleexp.scene import Scene
 
     started = time.perf_counter()
@@ -161,6 +163,8 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
         from styleexp.previews import check_available
 
         check_available(config.preview.platform)
+    for name in config.logger:
+        plugins.usable("logger", name)  # if it can't be, say so before the run
     judge = metrics.judge_name(config.metrics.judge, config.encoder.name)
     if judge in assets.names("weights"):
         assets.find(judge, "weights")  # if it can't be had, say so before the run, not after
@@ -187,38 +191,47 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
         record["encoder_precision"] = scene.loss.encoder.precision
     folder.write_json("run.json", record)
 
-    if state is not None and not _optimise(method, scene, state, folder):
-        return 130
-    result = method.finish(scene, state)
-    written = _write_results(result, folder)
-    seconds = time.perf_counter() - started
-    if config.report:  # last, as it shows what the others are about
-        from styleexp.reports import page
+    with Loggers(config, folder.path, record, state.step if state else 0) as loggers:
+        if state is not None and not _optimise(method, scene, state, folder, loggers):
+            return 130
+        result = method.finish(scene, state)
+        step = state.step if state else 0
+        written, measured = _write_results(result, folder)
+        seconds = time.perf_counter() - started
+        if config.report:  # last, as it shows what the others are about
+            from styleexp.reports import page
 
-        written.insert(0, page.write_ended(folder.path, result, seconds))
-    folder.write_status("done", step=state.step if state else 0, seconds=round(seconds, 1))
+            written.insert(0, page.write_ended(folder.path, result, seconds))
+        loggers.finish(result, folder.path, measured, step)
+        folder.write_status("done", step=step, seconds=round(seconds, 1))
     print(f"done in {seconds:.0f} s")
     _print_paths(written)
     return 0
 
 
-def _optimise(method: Method, scene: Subject, state: State, folder: records.RunFolder) -> bool:
+def _optimise(
+    method: Method, scene: Subject, state: State, folder: records.RunFolder, loggers: Loggers
+) -> bool:
     """Take the remaining steps; False if the user stopped them."""
     optim = scene.config.optim
     with _interruptible() as interrupted:
         for step in _progress(method.optimise(scene, state), state, optim.steps):
             folder.append_metrics(step)
+            loggers.step(step)
             if state.step % optim.checkpoint_every == 0 or interrupted:
                 folder.save_checkpoint(state)
             if interrupted and state.step < optim.steps:
                 folder.write_status("interrupted", step=state.step)
+                loggers.ended = "interrupted"
                 print(f"\nstopped at step {state.step}; go on with: styleexp resume={folder.path}")
                 return False
     folder.save_checkpoint(state)
     return True
 
 
-def _write_results(result: Result, folder: records.RunFolder) -> list[Path]:
+def _write_results(
+    result: Result, folder: records.RunFolder
+) -> tuple[list[Path], dict[str, float]]:
     from styleexp import previews
 
     for name in ("result.ply", "result.obj", "result.glb"):
@@ -233,7 +246,7 @@ def _write_results(result: Result, folder: records.RunFolder) -> list[Path]:
     print("  ".join(f"{name} {found[name]:.3g}" for name in SHOWN_METRICS if name in found))
     if config.preview.name == "pyrender":
         written += previews.write_check(result, folder.write)
-    return written
+    return written, found
 
 
 def _measure(result: Result, config: Config) -> dict[str, float]:

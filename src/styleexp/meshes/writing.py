@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 
+DISPLACEMENT = "_DISPLACEMENT"
+"""glTF wants custom attributes to begin with an underscore, and to be in capitals."""
+
+
 def save_mesh(
     mesh: Mesh,
     vertices: Float[np.ndarray, "vertices 3"],
@@ -33,7 +37,8 @@ def save_mesh(
     - PLY: one object without textures; ``displacement`` is its float vertex property.
     - OBJ: faces and materials in the file's order. Materials and images are written beside it,
       named after it: ``out.obj``, ``out.mtl``, ``out_wood.png``.
-    - GLB: a glTF file's scene as trimesh knows it; otherwise a node for each part.
+    - GLB: a glTF file's scene as trimesh knows it; otherwise a node for each part. ``displacement``
+      is the custom attribute ``_DISPLACEMENT``, in the mesh's own units whatever the nodes' scale.
 
     PLY and GLB hold single precision. Every file is replaced in one step, so an interrupted run
     leaves no half of one. Raises `UserError` if the place cannot be written, the extension is
@@ -66,7 +71,8 @@ def save_mesh(
         files = _obj(carrier, vertices, path)
     else:
         make = _moved_scene if carrier.scene is not None else _new_scene
-        scene = make(carrier, vertices, _row_normals(carrier, vertices))
+        values = None if displacement is None else np.asarray(displacement, np.float32)
+        scene = make(carrier, vertices, _row_normals(carrier, vertices), values)
         files = {path.name: scene.export(file_type="glb", include_normals=True)}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -102,6 +108,11 @@ def _distinct(*columns: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     return first, inverse.ravel()
 
 
+def ply_rows(carrier: Carrier) -> tuple[np.ndarray, np.ndarray]:
+    """The rows that a PLY file gets, in its order, and which of them each row became."""
+    return _distinct(carrier.rows, carrier.uv, carrier.colors)
+
+
 def _runs(carrier: Carrier) -> Iterator[tuple[int, int, np.ndarray]]:
     """Part, material (-1 for none) and faces, wherever one of the two changes."""
     n = len(carrier.corners)
@@ -113,7 +124,7 @@ def _runs(carrier: Carrier) -> Iterator[tuple[int, int, np.ndarray]]:
 
 
 def _ply(carrier: Carrier, vertices: np.ndarray, displacement: np.ndarray | None) -> bytes:
-    first, combined = _distinct(carrier.rows, carrier.uv, carrier.colors)
+    first, combined = ply_rows(carrier)
     rows = carrier.rows[first]
     colors = None if carrier.colors is None else carrier.colors[first]
     faces = combined[carrier.corners]
@@ -129,7 +140,9 @@ def _ply(carrier: Carrier, vertices: np.ndarray, displacement: np.ndarray | None
 # --------------------------------------------------------------------------------------------- GLB
 
 
-def _moved_scene(carrier: Carrier, vertices: np.ndarray, normals: np.ndarray) -> trimesh.Scene:
+def _moved_scene(
+    carrier: Carrier, vertices: np.ndarray, normals: np.ndarray, displacement: np.ndarray | None
+) -> trimesh.Scene:
     """The input's scene with new positions and normals, each in its node's frame."""
     scene = carrier.scene.copy()
     node_of = {scene.graph[node][1]: node for node in scene.graph.nodes_geometry}
@@ -143,10 +156,19 @@ def _moved_scene(carrier: Carrier, vertices: np.ndarray, normals: np.ndarray) ->
         moved = trimesh.transform_points(vertices[carrier.rows[rows]], np.linalg.pinv(matrix))
         shape.vertices = moved
         shape.vertex_normals = normals[rows] @ matrix[:3, :3]
+        _attach(shape, displacement, carrier.rows[rows])
     return scene
 
 
-def _new_scene(carrier: Carrier, vertices: np.ndarray, normals: np.ndarray) -> trimesh.Scene:
+def _attach(shape: trimesh.Trimesh, displacement: np.ndarray | None, rows: np.ndarray) -> None:
+    shape.vertex_attributes.pop(DISPLACEMENT, None)  # of an input that is itself a result
+    if displacement is not None:
+        shape.vertex_attributes[DISPLACEMENT] = displacement[rows]
+
+
+def _new_scene(
+    carrier: Carrier, vertices: np.ndarray, normals: np.ndarray, displacement: np.ndarray | None
+) -> trimesh.Scene:
     """A node for each part; if it has several materials, with a child for each."""
     pieces: dict[int, dict[int, list[np.ndarray]]] = {}
     for part, material, run in _runs(carrier):
@@ -167,6 +189,7 @@ def _new_scene(carrier: Carrier, vertices: np.ndarray, normals: np.ndarray) -> t
                 visual=_visual(carrier, material, rows),
                 process=False,
             )
+            _attach(shape, displacement, carrier.rows[rows])
             node, parent = label, None
             if len(by_material) > 1:
                 # trimesh's own mark of such a child; `load_mesh` calls it by its parent's name.

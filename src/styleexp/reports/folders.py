@@ -52,7 +52,15 @@ class Run:
         chosen = (self.record.get("config") or {}).get(kind) or {}
         if chosen.get("path"):
             return PurePath(chosen["path"]).stem
-        return str(chosen.get("name") or f"unknown {kind}")
+        return str(chosen.get("name") or self._planned(kind) or f"unknown {kind}")
+
+    def _planned(self, kind: str) -> str | None:
+        """The same of a run that never began, as far as its overrides tell."""
+        given = dict(each.lstrip("+").split("=", 1) for each in self.overrides if "=" in each)
+        if f"{kind}.path" in given:
+            return PurePath(given[f"{kind}.path"]).stem
+        source, _, style = given.get("pair", "").partition("_")  # as conf/pair names them
+        return given.get(kind) or {"source": source, "style": style}[kind] or None
 
     @property
     def command(self) -> str:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from styleexp.errors import UserError
-from styleexp.reports import folders, html, sweep_page
+from styleexp.reports import folders, html, page, sweep_page
 from styleexp.reports.collect import collect
 from styleexp.reports.shown import read_result
 
@@ -113,14 +113,36 @@ def pictures(frame: pandas.DataFrame, columns: str, rows: str = "pair") -> Shown
 
 
 def _show_row_head(axis: Any, line: pandas.DataFrame, label: str) -> None:
-    """The row's label, and its source and style out of a preview."""
-    axis.set_title(label, fontsize=9)
+    """The row's label, and out of a preview its source, and its style if it has but one."""
+    rows = (0, 1) if line["pair"].nunique() == 1 else (0,)
+    axis.set_title(f"{label}\n({'source, style' if len(rows) == 2 else 'source'})", fontsize=9)
     for path in line["path"]:
-        seen = [html.views(Path(path), row) for row in (0, 1)]
+        seen = [html.views(Path(path), row) for row in rows]
         if all(seen):
             pair = np.concatenate([np.asarray(row[0]) for row in seen], axis=1)
             axis.imshow(pair, cmap="gray", vmin=0, vmax=255)
             return
+
+
+def triples(frame: pandas.DataFrame, across: int = 2) -> Shown:
+    """Source, style and result of every run, ``across`` runs side by side. What did not finish is
+    a cell that says so."""
+    from matplotlib.figure import Figure
+
+    down = math.ceil(len(frame) / across)
+    figure = Figure(figsize=(4.6 * across, 1.8 * down), layout="constrained")
+    axes = figure.subplots(down, across, squeeze=False).ravel()
+    for axis in axes:
+        axis.set_axis_off()
+    for axis, (_, run) in zip(axes, frame.iterrows(), strict=False):
+        axis.set_title(f"{run['pair']} (source, style, result)", fontsize=9)
+        seen = [html.views(Path(run["path"]), row) for row in (0, 1, 2)]
+        if run["status"] != "done" or not all(seen):
+            axis.text(0.5, 0.5, run["status"], ha="center", color="#a3262b")
+            continue
+        line = np.concatenate([np.asarray(row[0]) for row in seen], axis=1)
+        axis.imshow(line, cmap="gray", vmin=0, vmax=255)
+    return _picture(figure)
 
 
 def bars(frame: pandas.DataFrame, by: str, metrics: Sequence[str]) -> Shown:
@@ -221,11 +243,30 @@ def claims(*each: Claim) -> HTML:
 
 def table(frame: pandas.DataFrame, metrics: Sequence[str] = ()) -> pandas.DataFrame:
     """The runs' axes and numbers, for people: those of ``metrics`` that are there, or all."""
-    axes = [column for column in frame if str(column).startswith("axis.")]
+    # What ``pair`` tells; and which experiment a run shared by several was started for.
+    told = ("axis.pair", "axis.source", "axis.style", "axis.experiment")
+    axes = [c for c in frame if str(c).startswith("axis.") and c not in told]
     measured = [f"metric.{m}" for m in metrics] or [c for c in frame if c.startswith("metric.")]
     wanted = ["pair", *axes, "seed", "status", "seconds", "loss", *measured]
     shown = frame[[column for column in wanted if column in frame]]
     return shown.rename(columns=lambda name: name.split(".", 1)[-1] if "." in name else name)
+
+
+def show(frame: pandas.DataFrame) -> HTML:
+    """A table for a page: four digits, dashes for what was not measured, the columns' meanings."""
+    from IPython.display import HTML
+
+    def cell(value: float) -> str:
+        return "–" if math.isnan(value) else f"{value:.4g}"
+
+    made = frame.to_html(index=False, border=0, classes="numbers", float_format=cell, na_rep="–")
+    known = {"seconds": "of the whole run", "loss": OWN_LOSS, **page.MEANINGS}
+    items = [f"<dt>{name}</dt><dd>{known[name]}</dd>" for name in frame if name in known]
+    legend = f"<dl class='meanings'>{''.join(items)}</dl>" if items else ""
+    return HTML(f"<div style='overflow-x:auto'>{made}</div>{legend}")
+
+
+OWN_LOSS = "of the run's last steps; other layers or weights have another scale"
 
 
 def save(frame: pandas.DataFrame, folder: str | Path | None, name: str) -> None:

@@ -123,6 +123,39 @@ def read_result(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     return np.asarray(mesh.vertices), np.asarray(mesh.faces), displacement
 
 
+def read_moved(folder: Path) -> tuple[meshes.Mesh, np.ndarray, np.ndarray]:
+    """A finished run's source, its moved vertices (vertices, 3), their displacement (vertices,).
+
+    Raises `UserError` where they can't be had.
+    """
+    from styleexp.meshes.writing import ply_rows
+    from styleexp.reports import folders
+
+    run, missing = folders.read(folder), list[str]()
+    path = folder / "result.ply"
+    if not path.is_file():
+        raise UserError(f"'{folder}' has no result.ply: give the folder of a finished run.")
+    source, _ = _load(run, missing)
+    if source is None:
+        raise UserError(f"'{folder}' can't be used: {' '.join(missing)}")
+    try:
+        stored, _, values = read_result(path)
+    except Exception as error:  # trimesh raises almost anything on a damaged file
+        raise UserError(f"'{path}' cannot be read ({error}): run again.") from None
+    rows = np.arange(len(source.vertices))
+    if source.carrier is not None:
+        rows = source.carrier.rows[ply_rows(source.carrier)[0]]
+    if values is None or len(stored) != len(rows):
+        raise UserError(
+            f"'{path}' has other vertices than its source '{source.name}' (as baseline="
+            "geometric_textures makes them, which resamples it), so its displacement is not of "
+            "the source."
+        )
+    moved, displacement = np.zeros_like(source.vertices), np.zeros(len(source.vertices))
+    moved[rows], displacement[rows] = stored, values
+    return source, moved, displacement
+
+
 def _load(run: Run, missing: list[str]) -> tuple[meshes.Mesh | None, Any]:
     """Source and style of a run's record, None where they can't be had as they were."""
     from omegaconf import OmegaConf

@@ -1,0 +1,259 @@
+"""What `mkdocs build` can't do by itself: pages made from the code, links into the repository, and the
+promise that the site asks nothing of the network."""
+
+import dataclasses
+import importlib
+import io
+import re
+from contextlib import redirect_stdout, suppress
+from functools import cache
+from pathlib import Path
+
+import griffe
+from mkdocs.exceptions import PluginError
+from mkdocs.structure.files import File
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = ROOT / "src" / "styleexp"
+
+API = {
+    "The method": (
+        "stylize", "scene", "fields", "views", "viewer", "losses", "styles", "relief", "config", "baselines", "baselines.geometric_textures",
+    ),
+    "Meshes and pictures": ("meshes", "meshes.mesh", "meshes.reading", "meshes.writing",
+                            "meshes.remeshing", "images", "shapes", "assets", "sources", "bake"),
+    "Renderers": ("renderers.base", "renderers.soft_raster", "renderers.soft_raster.renderer",
+                  "renderers.soft_raster.raster", "renderers.soft_raster.contour",
+                  "renderers.soft_raster.shading", "renderers.soft_raster.deferred",
+                  "renderers.mitsuba_ad", "renderers.moderngl_deferred", "testing"),
+    "Encoders": ("encoders", "encoders.vgg", "encoders.clip", "encoders.weights"),
+    "Parts and plugins": ("registry", "plugins", "loggers", "errors"),
+    "Runs, metrics, reports": ("records", "metrics", "metrics.style", "metrics.shape",
+                               "metrics.truth", "reports", "reports.collect",
+                               "reports.reliability", "reports.study_results", "sweeps.plan", "sweeps.runner", "agreement"),
+}  # fmt: skip
+COMMANDS = ("styleexp-assets", "styleexp-bake", "styleexp-metrics", "styleexp-plugins",
+            "styleexp-report", "styleexp-report study", "styleexp-sweep")  # fmt: skip
+EXTERNAL = re.compile(
+    r"""<(?:script|img|iframe|source|video|audio)\b[^>]*\bsrc=["']?(?:https?:)?//[^"'\s>]*"""
+    r"""|<link\b(?=[^>]*\brel=["']?(?:stylesheet|preload|preconnect|icon|prefetch|modulepreload))"""
+    r"""[^>]*\bhref=["']?(?:https?:)?//[^"'\s>]*"""
+    r"""|@import\s+(?:url\()?["']?(?:https?:)?//[^"')\s]*|url\(["']?(?:https?:)?//[^"')\s]*"""
+)
+API_PAGE = """---
+title: styleexp.{0}
+---
+
+::: styleexp.{0}
+    options:
+      heading_level: 1
+"""
+SHIM = "https://unpkg.com/iframe-worker/shim"
+LINK = re.compile(r"\[([^\]]+)\]\((\.\./[^)#\s]+)(#[^)\s]*)?\)")
+OBJECT = re.compile(r"`(styleexp\.[\w.]+)`")
+
+
+def on_files(files, config):
+    """Add the pages that are made from the code."""
+    made = {
+        "reference/configuration.md": configuration(),
+        "reference/commands.md": commands(),
+        "reference/api.md": api_index(),
+    }
+    for modules in API.values():
+        made |= {api_page(name): API_PAGE.format(name) for name in modules}
+    for uri, content in made.items():
+        files.append(File.generated(config, uri, content=content))
+    return files
+
+
+def on_page_markdown(markdown, page, config, files):
+    """Links to files of the repository: to what the site says of a module, else the file's name."""
+    if page.file.src_uri == "paper.md":
+        markdown = OBJECT.sub(lambda found: f"[`{found[1]}`][{found[1]}]", markdown)
+    return LINK.sub(lambda found: repository_link(*found.groups(), page.file.src_uri), markdown)
+
+
+def repository_link(text, target, anchor, page):
+    """What becomes of ``[text](../target)`` on a page in the top folder of the documentation."""
+    path = (ROOT / "docs" / page).parent.joinpath(target).resolve()
+    if not path.exists() or ROOT not in path.parents:
+        raise PluginError(f"docs/{page} links to {target}, which isn't there")
+    if PACKAGE in path.parents:
+        name = ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__")
+        if name == "config":
+            return f"[{text}](reference/configuration.md)"
+        if any(name in modules for modules in API.values()):
+            return f"[{text}]({api_page(name)})"
+    told = str(path.relative_to(ROOT))
+    return text if path.name in text.strip("`") or told in text else f"{text} (`{told}`)"
+
+
+def on_post_page(output, page, config):
+    """Refuse a page that would ask another machine for something. The search's helper for file://,
+    which the theme would load from elsewhere, is here."""
+    output = output.replace(SHIM, relative(page.url) + "assets/iframe-worker.js")
+    found = EXTERNAL.search(output)
+    if found:
+        raise PluginError(f"{page.file.src_uri} would load {found[0]}: the site works offline")
+    return output
+
+
+def relative(url):
+    """From a page back to the site's root."""
+    return "../" * url.count("/")
+
+
+def on_post_build(config):
+    """The same for style sheets."""
+    for path in Path(config["site_dir"]).rglob("*.css"):
+        found = EXTERNAL.search(path.read_text(encoding="utf-8"))
+        if found:
+            raise PluginError(f"{path} would load {found[0]}: the site works offline")
+
+
+# ---------------------------------------------------------------------------------- configuration
+
+
+@cache
+def _package():
+    return griffe.load("styleexp", search_paths=[str(ROOT / "src")])
+
+
+def source(name):
+    """A module as it is written, with the strings below its fields."""
+    return _package()[name]
+
+
+def configuration():
+    """Every key, its default and its meaning, from the dataclasses."""
+    from styleexp import config, plugins
+
+    module = source("config")
+    out = [
+        "# Configuration",
+        "Every key of a run, as `styleexp KEY=VALUE` takes it, with the default of the schema. "
+        "Presets (`method=`, `profile=`, `layers=`, …) set others; `styleexp --help` shows the "
+        "values that a choice of them gives. This page is made from "
+        "`styleexp/config.py` and the options of the registered parts when the site is built.",
+    ]
+    top = []
+    for field in dataclasses.fields(config.Config):
+        kind = getattr(config, f"{_camel(field.name)}Config", None)
+        if kind is None or field.name in ("baseline", "logger", "renderer"):
+            top.append(_row(module["Config"], field, field.name, config))
+    out += ["## The run itself", *_table(top)]
+    for field in dataclasses.fields(config.Config):
+        kind = getattr(config, f"{_camel(field.name)}Config", None)
+        if kind is not None:
+            out += _section(module, kind.__name__, field.name, config)
+    out.append("## Options of parts")
+    out.append(
+        "What a part has beside its `name` and the keys above, written `KIND.KEY=VALUE` "
+        "(`logger.NAME.KEY=VALUE`)."
+    )
+    for kind, about in plugins.KINDS.items():
+        rows = []
+        for spec in about.built_in.values():
+            if spec.config is about.base:
+                continue
+            owner = source(spec.config.__module__.removeprefix("styleexp."))
+            inherited = {f.name for f in dataclasses.fields(about.base)} if about.base else set()
+            prefix = f"{kind}.{spec.name}" if kind == "logger" else kind
+            for field in dataclasses.fields(spec.config):
+                if field.name != "name" and field.name not in inherited:
+                    row = _row(owner[spec.config.__name__], field, f"{prefix}.{field.name}", config)
+                    rows.append((f"`{spec.name}`", *row))
+        if rows:
+            out += [f"### {kind}", *_table(rows, ("name", "key", "default", "meaning"))]
+    return "\n\n".join(out) + "\n"
+
+
+def _section(module, name, prefix, config):
+    written = module[name]
+    rows, nested = [], []
+    for field in dataclasses.fields(getattr(config, name)):
+        if field.name == "local":
+            nested = _section(module, "LocalViewsConfig", f"{prefix}.local", config)
+        else:
+            rows.append(_row(written, field, f"{prefix}.{field.name}", config))
+    return [f"## {prefix}", _prose(written.docstring.value), *_table(rows), *nested]
+
+
+def _row(written, field, key, config):
+    attribute = written.members[field.name]
+    told = [_prose(attribute.docstring.value)] if attribute.docstring else []
+    if key in config.CHOICES:
+        told.append("One of " + ", ".join(f"`{each}`" for each in config.CHOICES[key]) + ".")
+    elif key in config.BETWEEN:
+        told.append("From {} to {}.".format(*config.BETWEEN[key]))
+    elif key in config.POSITIVE:
+        told.append("Above 0.")
+    return f"`{key}`", f"`{_default(field)}`", " ".join(told)
+
+
+def _default(field):
+    value = field.default
+    if value is dataclasses.MISSING:
+        value = field.default_factory()
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list):
+        return "[" + ", ".join(map(str, value)) + "]"
+    return "{}" if value == {} else str(value)
+
+
+def _table(rows, head=("key", "default", "meaning")):
+    lines = ["| " + " | ".join(head) + " |", "| " + " | ".join("---" for _ in head) + " |"]
+    lines += ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows]
+    return ["\n".join(lines)] if rows else []
+
+
+def _prose(text):
+    return re.sub(r"``(.*?)``", r"`\1`", " ".join(text.split()))
+
+
+def _camel(name):
+    return {"optim": "Optim"}.get(name, name.capitalize())
+
+
+# ------------------------------------------------------------------------------------ commands, API
+
+
+def commands():
+    """What every command says of itself."""
+    out = ["# Commands", "`styleexp` takes the keys of the [configuration](configuration.md).", ""]
+    for command in COMMANDS:
+        name, *rest = command.split()
+        module = importlib.import_module(f"styleexp.cli.{name.removeprefix('styleexp-')}")
+        text = io.StringIO()
+        with redirect_stdout(text), suppress(SystemExit):
+            module.main([*rest, "--help"])
+        out += [f"## {command}", "```text", text.getvalue().strip(), "```", ""]
+    return "\n".join(out)
+
+
+def api_index():
+    """The modules, with the first sentence of each."""
+    out = [
+        "# Python",
+        "`import styleexp` is instant; what is heavy is imported when it is used.",
+        "",
+    ]
+    for heading, modules in API.items():
+        out += [f"## {heading}", ""]
+        for name in modules:
+            doc = source(name).docstring
+            first = _prose(doc.value.split("\n\n")[0]) if doc else ""
+            out.append(
+                f"- [`styleexp.{name}`]({api_page(name).removeprefix('reference/')}): {first}"
+            )
+        out.append("")
+    return "\n".join(out)
+
+
+def api_page(name):
+    """Where a module's page lies."""
+    return f"reference/api/{name}.md"

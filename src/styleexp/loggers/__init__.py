@@ -1,0 +1,86 @@
+"""What a run also tells the tools that people already use; ``metrics.jsonl`` is always written.
+
+``logger=tensorboard``, ``logger=mlflow``, ``'logger=[tensorboard,mlflow]'``. A logger listens: it
+can't change a run, so it doesn't count for the keys of plans, and one that breaks is dropped with a
+warning.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    from styleexp.config import Config
+    from styleexp.stylize import Result, Step
+
+
+class Logger(Protocol):
+    """One run's listener, made when the run begins or is resumed."""
+
+    def log(self, values: Mapping[str, float], step: int) -> None:
+        """Take the numbers of a step; they are named as in ``metrics.jsonl``."""
+        ...
+
+    def finish(self, result: Result, folder: Path) -> None:
+        """Take the finished run: its pictures, mesh and page lie in ``folder``."""
+        ...
+
+    def close(self, status: str) -> None:
+        """The run has ended: "done", "interrupted" or "failed". Called once, whatever happened."""
+        ...
+
+
+class Loggers:
+    """All loggers of a run, as a context. An exception of theirs is a warning, and the end of that
+    logger."""
+
+    def __init__(self, config: Config, folder: Path, record: Mapping[str, Any], step: int):
+        """``step`` is the one that the run goes on from; later ones will be told again.
+
+        Raises `UserError` for a logger that can't begin: nothing has been computed yet.
+        """
+        from styleexp import plugins
+
+        self.ended = "failed"
+        """The run's status when the context ends: "done", "interrupted" or "failed"."""
+        self._loggers: dict[str, Logger] = {}
+        for name, options in config.logger.items():
+            built = plugins.build("logger", options, folder=folder, record=record, step=step)
+            self._loggers[name] = built
+
+    def step(self, step: Step) -> None:
+        """Tell what a step measured."""
+        values = {key: value for key, value in asdict(step).items() if key != "step"}
+        self._each(lambda logger: logger.log(values, step.step))
+
+    def finish(self, result: Result, folder: Path, metrics: Mapping[str, float], step: int) -> None:
+        """Tell what came out; ``metrics`` are those of ``metrics.json``, named ``final/…``."""
+        final = {f"final/{k}": float(v) for k, v in metrics.items() if isinstance(v, int | float)}
+        self._each(lambda logger: logger.log(final, step))
+        self._each(lambda logger: logger.finish(result, folder))
+        self.ended = "done"
+
+    def __enter__(self) -> Loggers:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
+        if kind is not None:
+            self.ended = "interrupted" if kind is KeyboardInterrupt else "failed"
+        self._each(lambda logger: logger.close(self.ended))
+
+    def _each(self, tell: Callable[[Logger], None]) -> None:
+        for name, logger in list(self._loggers.items()):
+            try:
+                tell(logger)
+            except Exception as error:
+                del self._loggers[name]
+                told = " ".join(str(error).split()) or type(error).__name__
+                warnings.warn(
+                    f"the logger '{name}' stopped ({told}); the run goes on, metrics.jsonl has it "
+                    "all.",
+                    stacklevel=2,
+                )
