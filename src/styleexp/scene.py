@@ -100,7 +100,11 @@ def load(config: Config) -> Subject:
         sigma=sigma / size,
         bound=bound * size,
         relief=height * size,
-        notes=(*source.repairs, *too_coarse(source, size / sigma)),
+        notes=(
+            *source.repairs,
+            *(f"style: {repair}" for repair in getattr(style, "repairs", ())),
+            *too_coarse(source, size / sigma),
+        ),
     )
 
 
