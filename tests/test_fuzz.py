@@ -1,7 +1,7 @@
 """Random meshes, files, overrides and cameras: no other error than one sentence.
 
 A short run with the same examples each time is in CI; `make stress` runs STYLEEXP_FUZZ times as
-many, other ones each time. What either finds is added to `corpus.py` or below as an example of its own.
+many, other ones each time. What either finds is added to `corpus.py`, or below as an example.
 """
 
 from __future__ import annotations
@@ -198,7 +198,7 @@ overrides = st.lists(
 @given(overrides)
 @example(["strength=nan"])
 @example(["views.count=1000000000"])
-@example(["loss.lambda_global=.inf"])
+@example(["loss.lambda_global=inf"])
 @example(["+hydra.callbacks.x._target_=os.system"])
 def test_random_overrides_make_a_configuration_or_one_sentence(chosen):
     from hydra.errors import HydraException

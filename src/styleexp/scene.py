@@ -135,6 +135,12 @@ def prepare(config: Config) -> Scene:
         else:
             target = styles.FixedTarget(loss, styles.image_bank(picture, config, unit))
     goal, own = target(0), styles.mesh_target(loss, viewer, surface.vertices)(0)
+    for what, grams in (("source", own), ("style", goal)):
+        if not any(bool(gram.any()) for part in grams for gram in part):
+            raise UserError(
+                f"the views see nothing of the {what}, no cell of any style layer is wholly its: "
+                "lower views.distance, or raise views.resolution and views.local.size."
+            )
     return Scene(
         **vars(subject),
         viewer=viewer,

@@ -205,9 +205,12 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
 def _optimise(method: Method, scene: Subject, state: State, folder: records.RunFolder) -> bool:
     """Take the remaining steps; False if the user stopped them."""
     optim = scene.config.optim
+    blank = 0
     with _interruptible() as interrupted:
-        for step in _progress(method.optimise(scene, state), state, optim.steps):
+        steps = _explained(method.optimise(scene, state), folder)
+        for step in _progress(steps, state, optim.steps):
             folder.append_metrics(step)
+            blank += getattr(step, "blank_views", 0)
             if state.step % optim.checkpoint_every == 0 or interrupted:
                 folder.save_checkpoint(state)
             if interrupted and state.step < optim.steps:
@@ -215,7 +218,26 @@ def _optimise(method: Method, scene: Subject, state: State, folder: records.RunF
                 print(f"\nstopped at step {state.step}; go on with: styleexp resume={folder.path}")
                 return False
     folder.save_checkpoint(state)
+    if blank:
+        what = "were skipped" if scene.config.loss.masked else "counted as background"
+        print(
+            f"note: {blank} views did not show the mesh and {what} (blank_views in metrics.jsonl)"
+        )
     return True
+
+
+def _explained(steps: Iterator[Step], folder: records.RunFolder) -> Iterator[Step]:
+    """The steps; where they diverge, the error also names the last good checkpoint."""
+    from styleexp.stylize import Diverged
+
+    try:
+        yield from steps
+    except Diverged as error:
+        good = folder.checkpoint_step()
+        kept = "There is no checkpoint yet."
+        if good is not None:
+            kept = f"The last good checkpoint is that of step {good}, {folder.checkpoint}."
+        raise UserError(f"{error} {kept}") from None
 
 
 def _write_results(result: Result, folder: records.RunFolder) -> list[Path]:

@@ -7,7 +7,7 @@ built on this differ in; light, outlines and every gradient are theirs in common
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import torch
@@ -104,20 +104,16 @@ class DeferredRenderer(Renderer):
             raise unknown_name("kind of normals", shading.normals, ("flat", "smooth"))
         # Views don't depend on each other, so without gradients they need not be there at once.
         at_once = max(1, MOST_PAIRS // max(faces.shape[0], vertices.shape[0], 1))
-        if len(cameras) > at_once and not (torch.is_grad_enabled() and vertices.requires_grad):
-            parts = []
-            for start in range(0, len(cameras), at_once):
-                some = slice(start, start + at_once)
-                lit = shading
-                if (
-                    isinstance(shading.light, torch.Tensor) and shading.light.dim() == 2
-                ):  # one for each
-                    lit = replace(shading, light=shading.light[some])
-                parts.append(self._render(vertices, faces, cameras[some], lit, resolution))
-            return RenderOutput(
-                *(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(parts[0]))
-            )
-        return self._render(vertices, faces, cameras, shading, resolution)
+        if len(cameras) <= at_once or (torch.is_grad_enabled() and vertices.requires_grad):
+            return self._render(vertices, faces, cameras, shading, lights, resolution)
+        parts = []
+        for start in range(0, len(cameras), at_once):
+            some = slice(start, start + at_once)
+            lit = lights[:, some]
+            parts.append(self._render(vertices, faces, cameras[some], shading, lit, resolution))
+        return RenderOutput(
+            *(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(RenderOutput))
+        )
 
     def _render(
         self,
@@ -125,6 +121,7 @@ class DeferredRenderer(Renderer):
         faces: Int[Tensor, "faces 3"],
         cameras: Cameras,
         shading: Shading,
+        lights: Float[Tensor, "lights views 3"],
         resolution: tuple[int, int],
     ) -> RenderOutput:
         corners = faces.t().contiguous().long()
