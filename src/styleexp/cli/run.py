@@ -54,13 +54,10 @@ def begin(config: Config, folder: Path, overrides: list[str]) -> int:
 
 def resume(folder: Path) -> int:
     """Go on with an interrupted run from its checkpoint."""
-    from omegaconf import OmegaConf
-
     from styleexp import compose
 
     record = records.read_record(folder)
-    compose.register()
-    config = compose.typed(OmegaConf.create(record["config"]))
+    config = compose.recorded(record.get("config"))
     with _alone(folder):
         return _guarded(config, records.RunFolder(folder), record, resumed=True)
 
