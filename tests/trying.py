@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import functools
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -16,12 +18,26 @@ OVERRIDES = ("profile=smoke", "encoder=vgg19_random", "optim.steps=1", "preview.
 
 
 @functools.cache
-def _encoder() -> Any:
+def _encoder(precision: str) -> Any:
     from styleexp import plugins
     from styleexp.compose import compose
 
-    options = compose(OVERRIDES).encoder
+    options = compose([*OVERRIDES, f"encoder.precision={precision}"]).encoder
     return plugins.build("encoder", options, device="cpu", seed=0)
+
+
+@contextlib.contextmanager
+def one_encoder(precision: str = "auto") -> Iterator[None]:
+    """Every scene gets the same random encoder: to make one takes longer than a small run."""
+    from styleexp import plugins
+
+    real = plugins.build
+
+    def build(kind: str, options: Any, **given: Any) -> Any:
+        return _encoder(precision) if kind == "encoder" else real(kind, options, **given)
+
+    with mock.patch("styleexp.scene.build", build):
+        yield
 
 
 @functools.cache
@@ -46,19 +62,13 @@ def outcome(case: Case, folder: Path, shared: Path) -> tuple[str, str, Any]:
 
     ``folder`` is empty; ``shared`` keeps what all share. Only `UserError` counts as a refusal.
     """
-    from styleexp import plugins
     from styleexp.errors import UserError
     from styleexp.scene import prepare
     from styleexp.stylize import finish, optimise, start
 
     config = copy.deepcopy(_config(shared))
     (config.style if case.style else config.source).path = str(case.write(folder))
-    real = plugins.build
-
-    def build(kind: str, options: Any, **given: Any) -> Any:  # one encoder for all: half the time
-        return _encoder() if kind == "encoder" else real(kind, options, **given)
-
-    with warnings.catch_warnings(record=True) as caught, mock.patch("styleexp.scene.build", build):
+    with warnings.catch_warnings(record=True) as caught, one_encoder():
         warnings.simplefilter("always")
         try:
             scene = prepare(config)
