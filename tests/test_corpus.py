@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
-from corpus import CASES
-from trying import check
+from corpus import CASES, REFUSED, REPAIRED, obj
+from trying import OVERRIDES, check
+
+ROOT = Path(__file__).parent.parent
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 
@@ -20,8 +26,8 @@ def test_case(name, tmp_path, shared):
 
 
 THROUGH_THE_COMMAND = (
-    "soup.stl", "link.obj", "moving.webp", "cut60.glb", "vast.png", "up.gltf", "nan.ply", "deep.glb",
-    "draco.glb", "new\nline.obj", "folder.obj/inside.txt", "source.png",
+    "soup.stl", "link.obj", "moving.webp", "new\nline.obj", "cut60.glb", "vast.png", "up.gltf",
+    "nan.ply", "draco.glb", "cycle.glb", "folder.obj/inside.txt", "source.png",
 )  # fmt: skip
 
 
@@ -30,9 +36,10 @@ def test_through_the_command(name, tmp_path):
     """A real process: its exit code, its one line, and what it leaves in the run's folder."""
     case = CASES[name]
     path = str(case.write(tmp_path)).replace("\\", "\\\\").replace("'", "\\'")
-    given = ["source=torus", f"style.path='{path}'"]
+    (tmp_path / "ball.obj").write_bytes(obj())
+    given = ["source.path=ball.obj", f"style.path='{path}'"]
     if not case.style:
-        given = [f"source.path='{path}'", "style=bubble"]
+        given = [f"source.path='{path}'", "style.path=ball.obj"]
     done = subprocess.run(
         [sys.executable, "-m", "styleexp", *given, *OVERRIDES, "report=false",
          "preview.turntable_frames=1", "hydra.run.dir=run"],

@@ -70,7 +70,7 @@ def soups(draw):
     return np.array(points, dtype=float).reshape(-1, 3), polygons
 
 
-@examples(150)
+@examples(100)
 @given(soups())
 @example((np.eye(3), [(0, 1, 2), (0, 1, 2), (2, 1, 0), (0, 0, 1)]))
 def test_random_topology_is_kept_or_refused(tmp_path_factory, soup):
@@ -134,7 +134,7 @@ def edited(data: bytes, changes) -> bytes:
 def test_mutated_meshes_are_read_or_refused(kind, tmp_path):
     path = tmp_path / f"mutated.{kind}"
 
-    @examples(40)
+    @examples(30)
     @given(edits)
     def attempt(changes):
         path.write_bytes(edited(WHOLE[kind], changes))
@@ -151,7 +151,7 @@ def test_mutated_meshes_are_read_or_refused(kind, tmp_path):
 def test_mutated_pictures_are_read_or_refused(kind, tmp_path):
     path = tmp_path / "mutated.png"
 
-    @examples(40)
+    @examples(30)
     @given(edits)
     def attempt(changes):
         path.write_bytes(edited(PICTURES[kind], changes))
@@ -194,7 +194,7 @@ overrides = st.lists(
 )
 
 
-@examples(40)
+@examples(30)
 @given(overrides)
 @example(["strength=nan"])
 @example(["views.count=1000000000"])
@@ -240,7 +240,7 @@ def renders(draw):
     return vertices, index, cameras, shading, size
 
 
-@examples(150)
+@examples(100)
 @given(renders())
 def test_any_render_is_finite(scene):
     vertices, faces, cameras, shading, size = scene
@@ -267,7 +267,7 @@ def test_coordinates_near_the_end_of_float32_raise_nothing():
         assert not torch.isnan(out.depth).any()
 
 
-@examples(100)
+@examples(60)
 @given(
     st.floats(-1e4, 1e4), st.floats(-1e4, 1e4), st.floats(1e-3, 1e3),
     st.sampled_from([-90.0, -85.0, -80.0, 80.0, 85.0, 90.0, None]),
