@@ -56,7 +56,7 @@ sbom: $(VENV)-security/.installed $(VENV)/.installed-dev
 
 audit: $(VENV)-security/.installed $(VENV)/.installed-dev
 	$(BIN)/python -m pip freeze --exclude-editable > $(VENV)-security/frozen.txt
-	$(VENV)-security/bin/pip-audit --disable-pip --no-deps -r $(VENV)-security/frozen.txt
+	$(VENV)-security/bin/pip-audit --strict --disable-pip --no-deps -r $(VENV)-security/frozen.txt
 
 $(VENV)-security/.installed: Makefile
 	test -x $(VENV)-security/bin/python || $(PYTHON) -m venv $(VENV)-security

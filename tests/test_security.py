@@ -178,3 +178,31 @@ def test_plugins_come_from_entry_points_or_the_variable_alone(tmp_path):
     code = "from styleexp import plugins; plugins.everything()"
     subprocess.run([sys.executable, "-P", "-c", code], cwd=tmp_path, check=True)
     assert not (tmp_path / "was-run").exists()
+
+
+def test_a_page_of_a_strangers_run_holds_its_texts_as_texts(tmp_path):
+    """Wherever run.json and status.json may hold text; tests/test_reports_browser.py has a mesh of
+    such a name in a real browser."""
+    from styleexp.reports import page
+
+    evil = "</script></code><script>window.ran=1</script><img src=x onerror=window.ran=1>"
+    record = {
+        "schema": 1,
+        "overrides": [f"source={evil}"],
+        "command": [evil],
+        "config": {"source": {"name": evil, "path": evil}, evil: evil},
+        "notes": [evil],
+        "versions": {evil: evil},
+        "platform": {evil: evil},
+        "chosen": {evil: evil},
+        "assets": {"source": {"name": evil, "path": evil, "sha256": evil}},
+        "started": evil,
+        "threads": evil,
+    }
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    (tmp_path / "status.json").write_text(json.dumps({"status": "failed", "reason": evil}))
+    (tmp_path / "metrics.json").write_text(json.dumps({evil: 1.0}))
+    text = page.rewrite(tmp_path).read_text(encoding="utf-8")
+    assert text.count("window.ran") > 5
+    assert "<script>window" not in text
+    assert "<img src=x" not in text
