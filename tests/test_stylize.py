@@ -1,6 +1,7 @@
 """The whole pipeline on small shapes, with random weights where the style doesn't matter."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -48,7 +49,7 @@ def test_the_rate_rises_then_falls_or_goes_down_in_the_papers_steps():
     rates = [learning_rate(cosine, step) for step in range(100)]
     assert rates[0] == pytest.approx(0.1)
     assert rates.index(max(rates)) == 9
-    assert all(a > b for a, b in zip(rates[9:], rates[10:], strict=False))
+    assert all(a > b for a, b in itertools.pairwise(rates[9:]))
     assert rates[-1] == pytest.approx(0.05, abs=0.005)
     paper = OptimConfig(steps=1000, rate=5e-4, schedule="step", decay=0.9, decay_every=100)
     assert learning_rate(paper, 99) == 5e-4
