@@ -3,7 +3,10 @@
 # make lint   ruff and mypy
 # make docs   the documentation, to site/index.html; warnings are errors
 # make conformance   write docs/conformance.md from the checks of every renderer
-# make stress   kill runners and workers of sweeps ten times each, with every local launcher
+# make stress   kill runners and workers of sweeps ten times each, with every local launcher; random
+#               meshes, files, overrides and renders, STRESS_FUZZ times as many as in CI
+# make sbom   what .venv holds, as CycloneDX, in build/sbom.json (tools in .venv-security)
+# make audit  known weaknesses of what .venv holds (asks pypi.org)
 # make ray-test   a sweep on a local Ray cluster, in an environment of its own (.venv-ray)
 # Override: PYTHON (which interpreter), CONSTRAINTS (pinned versions; empty for none), PIP_FLAGS.
 
@@ -14,12 +17,16 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check \
 	$(if $(CONSTRAINTS),--constraint $(CONSTRAINTS)) $(PIP_FLAGS)
 
+# How many times as many random examples as in CI, and how many seconds they may take in all.
+STRESS_FUZZ ?= 50
+STRESS_SECONDS ?= 3600
+
 # Two busy cores and spinning OpenMP threads make everything many times slower.
 export OMP_WAIT_POLICY ?= PASSIVE
 # Named meshes and images, where there are some beside the checkout.
 export STYLEEXP_ASSETS ?= $(wildcard $(abspath ../shared))
 
-.PHONY: demo test lint docs conformance stress ray-test clean
+.PHONY: demo test lint docs conformance stress sbom audit ray-test clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -43,6 +50,24 @@ conformance: $(VENV)/.installed-dev
 
 stress: $(VENV)/.installed-dev
 	STYLEEXP_KILLS=10 OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/test_sweeps.py -k kill_9
+	STYLEEXP_FUZZ=$(STRESS_FUZZ) OMP_NUM_THREADS=1 timeout $(STRESS_SECONDS) \
+		$(BIN)/python -m pytest tests/test_fuzz.py
+
+sbom: $(VENV)-security/.installed $(VENV)/.installed-dev
+	mkdir -p build
+	$(VENV)-security/bin/cyclonedx-py environment $(BIN)/python --pyproject pyproject.toml \
+		--output-reproducible --of JSON -o build/sbom.json
+	@echo build/sbom.json
+
+audit: $(VENV)-security/.installed $(VENV)/.installed-dev
+	$(BIN)/python -m pip freeze --exclude-editable > $(VENV)-security/frozen.txt
+	$(VENV)-security/bin/pip-audit --strict --disable-pip --no-deps -r $(VENV)-security/frozen.txt
+
+$(VENV)-security/.installed: Makefile
+	test -x $(VENV)-security/bin/python || $(PYTHON) -m venv $(VENV)-security
+	$(VENV)-security/bin/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) \
+		'cyclonedx-bom==7.5.0' 'pip-audit==2.10.1'
+	@touch $@
 
 # The Ray launcher pins cloudpickle below the tested version.
 ray-test: pyproject.toml constraints.txt
@@ -53,7 +78,7 @@ ray-test: pyproject.toml constraints.txt
 	OMP_NUM_THREADS=1 $(VENV)-ray/bin/python -m pytest tests/test_ray.py
 
 clean:
-	rm -rf $(VENV) $(VENV)-ray build dist src/*.egg-info
+	rm -rf $(VENV) $(VENV)-ray $(VENV)-security build dist src/*.egg-info
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

@@ -127,7 +127,8 @@ def test_first_frame_of_an_animation(tmp_path):
     for suffix in ("gif", "webp", "png"):
         path = tmp_path / f"a.{suffix}"
         frames[0].save(path, save_all=True, append_images=frames[1:])
-        np.testing.assert_allclose(load_image(path)[10, 10], [1, 0, 0], atol=0.02)
+        with pytest.warns(UserWarning, match="first of 2 frames"):
+            np.testing.assert_allclose(load_image(path)[10, 10], [1, 0, 0], atol=0.02)
 
 
 def test_not_there_folder_empty(tmp_path):

@@ -259,6 +259,10 @@ def test_study_is_rated_saved_and_analysed(runs, tmp_path):
     answers = [json.loads(path.read_text()) for path in files]
     assert len({each["participant"] for each in answers}) == PARTICIPANTS
     assert all(each["simulated"] for each in answers)
+    assert set(answers[0]) <= {  # nothing about the participant
+        "schema", "study", "title", "participant", "simulated", "study_seed", "order_seed",
+        "order", "pairs", "ratings", "seconds",
+    }  # fmt: skip
     assert len({tuple(each["order"]) for each in answers}) == 2  # both orders were seen
     for seed, each in enumerate(answers):
         chance = random.Random(seed)

@@ -12,7 +12,14 @@ from styleexp.compose import compose
 from styleexp.config import OptimConfig
 from styleexp.errors import UserError
 from styleexp.scene import choose_device, prepare
-from styleexp.stylize import finish, learning_rate, normalise_gradient, optimise, start
+from styleexp.stylize import (
+    finish,
+    gradient_length,
+    learning_rate,
+    normalise_gradient,
+    optimise,
+    start,
+)
 
 SMOKE = ("profile=smoke", "encoder=vgg19_random")
 pytestmark = pytest.mark.filterwarnings("ignore:the encoder 'vgg19_random'")
@@ -60,13 +67,13 @@ def test_a_normalised_gradient_has_length_one_and_its_own_direction():
     field = torch.nn.Linear(3, 2)
     (field(torch.ones(3)) * torch.tensor([1e4, -3e3])).sum().backward()
     before = [p.grad.clone() for p in field.parameters()]
-    normalise_gradient(field)
+    normalise_gradient(field, gradient_length(field))
     after = [p.grad for p in field.parameters()]
     assert sum(g.square().sum() for g in after).sqrt() == pytest.approx(1.0)
     ratios = torch.cat([(a / b).flatten() for a, b in zip(after, before, strict=True)])
     torch.testing.assert_close(ratios, ratios[:1].expand_as(ratios))
     field.zero_grad(set_to_none=False)
-    normalise_gradient(field)
+    normalise_gradient(field, gradient_length(field))
     assert all((p.grad == 0).all() for p in field.parameters())
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Sequence
 from typing import Any
@@ -10,8 +11,9 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
 from styleexp import config as schema
-from styleexp import plugins
+from styleexp import plugins, targets
 from styleexp.assets import names as asset_names
+from styleexp.errors import UserError
 from styleexp.shapes import SOURCES, STYLES
 
 CONFIG_PATH = "pkg://styleexp.conf"
@@ -22,6 +24,7 @@ several, by their names."""
 
 def register() -> None:
     """Tell Hydra the schema, and one option for each registered name. Safe to call again."""
+    targets.guard()
     store = ConfigStore.instance()
     store.store(name="base_config", node=schema.Config)
     for name in schema.CHOICES["preview.name"]:
@@ -61,6 +64,24 @@ def typed(config: DictConfig) -> schema.Config:
         setattr(built, kind, part)
     built.logger = {name: _part("logger", options) for name, options in loggers.items()}
     return built
+
+
+def recorded(config: Any) -> schema.Config:
+    """The configuration of a run's record, which may come from anywhere: all of it is values.
+
+    Raises `UserError` for an interpolation, which could read the environment, and for what is not
+    a configuration of this version.
+    """
+    from omegaconf.errors import OmegaConfBaseException
+
+    if "${" in json.dumps(config, default=str):
+        raise UserError("the run's record holds an interpolation (${...}), not values alone.")
+    register()
+    try:
+        return typed(OmegaConf.create(config))
+    except (OmegaConfBaseException, AssertionError, AttributeError, TypeError, ValueError) as error:
+        told = (str(error).splitlines() or [type(error).__name__])[0]
+        raise UserError(f"the run's record is no configuration of this version: {told}") from error
 
 
 def _part(kind: str, plain: dict[str, Any] | None) -> Any:

@@ -7,7 +7,9 @@ This module imports nothing heavy: ``styleexp --help`` reads it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, is_dataclass
 from dataclasses import field as option
 from typing import Any
 
@@ -288,27 +290,27 @@ CHOICES: dict[str, tuple[Any, ...]] = {
 }
 
 POSITIVE = (
-    "style.scale",
-    "style.image_tile",
-    "field.features",
-    "field.width",
-    "views.count",
-    "views.distance",
-    "views.local.per_view",
     "views.local.share",
-    "views.local.extent",
-    "loss.bank_views",
-    "optim.steps",
     "optim.rate",
     "optim.decay",
     "optim.decay_every",
     "optim.checkpoint_every",
-    "preview.turntable_frames",
-    "metrics.windows",
 )
 
 BETWEEN = {
     "source.remesh": (100, 10_000_000),
+    "style.scale": (1e-3, 1e3),
+    "style.image_tile": (1e-3, 1e3),
+    "field.features": (1, 65_536),
+    "field.width": (1, 65_536),
+    "views.count": (1, 4096),
+    "views.distance": (1e-3, 1e3),
+    "views.local.per_view": (1, 4096),
+    "views.local.extent": (1e-3, 1e3),
+    "loss.bank_views": (1, 1_000_000),
+    "optim.steps": (1, 1_000_000_000),
+    "preview.turntable_frames": (1, 10_000),
+    "metrics.windows": (1, 100_000),
     "style.image_contrast": (0.0, 0.5),
     "field.sigma": (1e-3, 1e3),
     "field.bound": (1e-4, 1.0),
@@ -335,6 +337,9 @@ def check(config: Config) -> None:
     for key, allowed in CHOICES.items():
         if _value(config, key) not in allowed:
             raise unknown_name(f"value for {key}", str(_value(config, key)), map(str, allowed))
+    for key, value in _numbers(config):
+        if not math.isfinite(value):
+            raise UserError(f"{key}={value} is not allowed: give a finite number.")
     for key in POSITIVE:
         if not _value(config, key) > 0:
             raise UserError(f"{key}={_value(config, key)} is not allowed: give a value above 0.")
@@ -358,6 +363,19 @@ def check(config: Config) -> None:
                 f"shading.background={background} is not allowed: give white, black, foreground or "
                 "a grey from 0 to 1."
             )
+
+
+def _numbers(part: Any, prefix: str = "") -> Iterator[tuple[str, float]]:
+    """Every number of a configuration, with its key."""
+    if isinstance(part, int | float):
+        yield prefix, part
+    elif isinstance(part, list):
+        for value in part:
+            yield from _numbers(value, prefix)
+    elif is_dataclass(part):
+        for each in fields(part):
+            key = f"{prefix}.{each.name}" if prefix else each.name
+            yield from _numbers(getattr(part, each.name), key)
 
 
 def _value(config: Config, key: str) -> Any:

@@ -21,6 +21,7 @@ MIN_SIDE = 16
 """Pixels: the deepest style layer has one cell per 16 pixels."""
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "GIF", "BMP", "PPM", "JPEG2000", "AVIF")
 """Raster formats only: for EPS and the like Pillow would start other programs."""
+TEXTURE_FORMATS = (*FORMATS, "TGA", "DDS", "MPO")
 
 
 def load_image(path: str | Path, *, background: float = 1.0) -> Float[np.ndarray, "height width 3"]:
@@ -64,6 +65,10 @@ def load_image(path: str | Path, *, background: float = 1.0) -> Float[np.ndarray
                         f"the image '{path}' is {image.width}x{image.height} pixels; "
                         f"it needs at least {MIN_SIDE} on each side."
                     )
+                frames = getattr(image, "n_frames", 1)
+                if frames > 1 and image.format != "MPO":  # a phone's MPO holds a thumbnail, too
+                    told = f"'{path}' is an animation or has pages: the first of {frames} frames"
+                    warnings.warn(f"{told} is taken.", stacklevel=2)
                 pixels = _rgb(ImageOps.exif_transpose(image), path, background)
     except UserError:
         raise
@@ -82,6 +87,40 @@ def load_image(path: str | Path, *, background: float = 1.0) -> Float[np.ndarray
             f"the image '{path}' is damaged or cut short and cannot be decoded ({reason})."
         ) from error
     return pixels
+
+
+def fault(content: bytes) -> str:
+    """Why a mesh's texture can't be decoded, the end of a sentence; empty if it can."""
+    import io
+
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            Image.init()
+            readable = [name for name in TEXTURE_FORMATS if name in Image.OPEN]
+            with Image.open(io.BytesIO(content), formats=readable) as image:
+                return fault_of(image)
+    except Image.DecompressionBombError:
+        return f"has more than {Image.MAX_IMAGE_PIXELS} pixels"
+    except Exception:  # as in `load_image`
+        return "is no picture that can be read"
+
+
+def fault_of(image: Image.Image) -> str:
+    """The same of a picture that Pillow has opened. Decodes it."""
+    from PIL import Image
+
+    if image.format is not None and image.format not in TEXTURE_FORMATS:
+        return f"is of the format {image.format}, which is not read"
+    if Image.MAX_IMAGE_PIXELS and image.width * image.height > Image.MAX_IMAGE_PIXELS:
+        return f"has more than {Image.MAX_IMAGE_PIXELS} pixels"
+    try:
+        image.load()
+    except Exception:  # as in `load_image`
+        return "is damaged or cut short"
+    return ""
 
 
 def luminance(rgb: Array) -> Array:

@@ -145,6 +145,16 @@ class RunFolder:
             os.replace(self.checkpoint, self.path / "checkpoint.previous.safetensors")
         self.write("checkpoint.safetensors", lambda path: path.write_bytes(content))
 
+    def checkpoint_step(self) -> int | None:
+        """The step of the latest checkpoint; None where there is none that can be read."""
+        from safetensors import safe_open
+
+        try:
+            with safe_open(self.checkpoint, framework="pt") as opened:
+                return int(opened.metadata()["step"])
+        except Exception:  # safetensors raises several kinds
+            return None
+
     def load_checkpoint(self, state: State) -> str | None:
         """Bring ``state`` to the latest readable checkpoint; returns what to tell the user.
 

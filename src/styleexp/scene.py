@@ -100,7 +100,11 @@ def load(config: Config) -> Subject:
         sigma=sigma / size,
         bound=bound * size,
         relief=height * size,
-        notes=(*source.repairs, *too_coarse(source, size / sigma)),
+        notes=(
+            *source.repairs,
+            *(f"style: {repair}" for repair in getattr(style, "repairs", ())),
+            *too_coarse(source, size / sigma),
+        ),
     )
 
 
@@ -131,6 +135,12 @@ def prepare(config: Config) -> Scene:
         else:
             target = styles.FixedTarget(loss, styles.image_bank(picture, config, unit))
     goal, own = target(0), styles.mesh_target(loss, viewer, surface.vertices)(0)
+    for what, grams in (("source", own), ("style", goal)):
+        if not any(bool(gram.any()) for part in grams for gram in part):
+            raise UserError(
+                f"the views see nothing of the {what}, no cell of any style layer is wholly its: "
+                "lower views.distance, or raise views.resolution and views.local.size."
+            )
     return Scene(
         **vars(subject),
         viewer=viewer,

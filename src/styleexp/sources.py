@@ -13,7 +13,10 @@ if TYPE_CHECKING:
 
     from styleexp.config import Config, SourceConfig, StyleConfig
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
+IMAGE_SUFFIXES = (
+    *(".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff"),
+    *(".bmp", ".gif", ".ppm", ".pgm", ".jp2", ".avif"),
+)
 
 
 def load_source(config: SourceConfig) -> meshes.Mesh:
@@ -68,6 +71,11 @@ def _load(kind: str, name: str | None, path: str | None) -> meshes.Mesh | np.nda
         return shapes.make(name)
     if found.suffix.lower() in IMAGE_SUFFIXES:
         return images.load_image(found)
+    if kind == "style" and found.suffix.lower() not in (*assets.SUFFIXES["mesh"], ""):
+        raise UserError(
+            f"the style '{found}' ends in '{found.suffix}': give a mesh "
+            f"({', '.join(assets.SUFFIXES['mesh'])}) or a picture ({', '.join(IMAGE_SUFFIXES)})."
+        )
     return meshes.load_mesh(found)
 
 

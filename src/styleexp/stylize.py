@@ -32,6 +32,22 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from styleexp.config import Config, OptimConfig
+    from styleexp.viewer import Images
+
+
+EXPLODED = 1e6
+"""A loss so many times the first one's is no loss any more."""
+
+
+class Diverged(UserError):
+    """The numbers of a step can't be gone on with."""
+
+    def __init__(self, step: int, part: str, told: str):
+        self.step, self.part = step, part
+        super().__init__(
+            f"{told} at step {step}: lower optim.rate, or check the source and the style for "
+            "degenerate geometry."
+        )
 
 
 WARM_UP = 0.1
@@ -59,6 +75,8 @@ class Step:
     loss_local: float
     rms_displacement: float
     """In radii of the normalised source."""
+    blank_views: int
+    """Views that don't show the mesh: a masked loss (``loss.masked``) skips them."""
     seconds: float = field(compare=False)
 
 
@@ -121,6 +139,7 @@ def start(scene: Scene) -> State:
 def optimise(scene: Scene, state: State) -> Iterator[Step]:
     """Run the remaining steps, yielding after each; ``state`` may be saved between them."""
     optim, loss, surface = scene.config.optim, scene.loss, scene.surface
+    first: float | None = None
     while state.step < optim.steps:
         begun = time.perf_counter()
         for group in state.optimizer.param_groups:
@@ -135,17 +154,29 @@ def optimise(scene: Scene, state: State) -> Iterator[Step]:
         loss_global = loss.distance(loss.grams(whole), whole_target, scene.scales[0])
         loss_local = loss.distance(loss.grams(local), local_target, scene.scales[1])
         total = loss.config.lambda_global * loss_global + loss.config.lambda_local * loss_local
-        total = total + loss.config.relief_weight * (displacement / scene.relief).pow(4).mean()
+        relief = (displacement / scene.relief).pow(4).mean()
+        total = total + loss.config.relief_weight * relief
 
-        if not math.isfinite(total.item()):
-            raise UserError(
-                f"the loss became {total.item()} at step {state.step}: lower optim.rate, or check "
-                f"'{scene.source.name}' for degenerate geometry."
-            )
+        first = total.item() if first is None else first
+        _check_numbers(
+            state.step,
+            {
+                "the displacement": displacement,
+                "the global views": whole.image,
+                "the local views": local.image,
+                "the loss of the global views": loss_global,
+                "the loss of the local views": loss_local,
+                "the loss": total,
+            },
+            total.item(),
+            first,
+        )
         state.optimizer.zero_grad()
         total.backward()
+        gradient = gradient_length(state.field)
+        _check_numbers(state.step, {"the gradient": gradient}, 0.0, 0.0)
         if optim.unit_gradient:
-            normalise_gradient(state.field)
+            normalise_gradient(state.field, gradient)
         state.optimizer.step()
         state.step += 1
         yield Step(
@@ -154,15 +185,37 @@ def optimise(scene: Scene, state: State) -> Iterator[Step]:
             loss_global.item(),
             loss_local.item(),
             displacement.detach().square().mean().sqrt().item(),
+            blank(whole) + blank(local),
             time.perf_counter() - begun,
         )
 
 
-def normalise_gradient(field: torch.nn.Module) -> None:
-    """Scale the gradient of all parameters together to length 1; zero stays zero."""
-    gradients = [p.grad for p in field.parameters() if p.grad is not None]
-    length = torch.nn.utils.get_total_norm(gradients).clamp(min=1e-30)
-    torch._foreach_div_(gradients, length)
+def gradient_length(field: torch.nn.Module) -> Float[Tensor, ""]:
+    """Length of the gradient of all parameters together."""
+    return torch.nn.utils.get_total_norm([p.grad for p in field.parameters() if p.grad is not None])
+
+
+def normalise_gradient(field: torch.nn.Module, length: Float[Tensor, ""]) -> None:
+    """Scale the gradient of all parameters together, of this length, to 1; zero stays zero."""
+    for parameter in field.parameters():
+        if parameter.grad is not None:
+            parameter.grad /= length.clamp(min=1e-30)
+
+
+def _check_numbers(step: int, parts: dict[str, Tensor], total: float, first: float) -> None:
+    """Raise `Diverged` at the first part that isn't finite, or where the loss ``total`` is
+    `EXPLODED` times what it was ``first``. All parts count: a fused ReLU turns NaN into 0, so a
+    picture's may not reach the loss. The field is as it was before the step."""
+    for part, values in parts.items():
+        if not values.isfinite().all():
+            raise Diverged(step, part, f"{part} became NaN or infinite")
+    if abs(total) > EXPLODED * (1 + abs(first)):
+        raise Diverged(step, "the loss", f"the loss exploded, from {first:.3g} to {total:.3g},")
+
+
+def blank(seen: Images) -> int:
+    """How many of the views don't show the mesh at all."""
+    return int((seen.coverage.flatten(1).amax(1) <= 0).sum())
 
 
 def learning_rate(optim: OptimConfig, step: int) -> float:

@@ -26,7 +26,7 @@ from styleexp.errors import UserError
 from styleexp.geometry import Surface, vertex_areas
 from styleexp.relief import smoother
 from styleexp.scene import Subject, load
-from styleexp.stylize import Result, State
+from styleexp.stylize import Diverged, Result, State
 from styleexp.views import step_generator
 
 if TYPE_CHECKING:
@@ -187,9 +187,8 @@ class GeometricTextures:
             state.step += 1
             loss, critic, penalty, error = np.mean(told, axis=0).tolist()
             if not np.isfinite([loss, critic, penalty, error]).all():
-                raise UserError(
-                    f"the training diverged at step {state.step}, level {number}: lower optim.rate."
-                )
+                part = f"the loss of level {number}"
+                raise Diverged(state.step, part, f"{part} became NaN or infinite")
             seconds = time.perf_counter() - begun
             yield TextureStep(state.step, number, loss, critic, penalty, error, seconds)
 

@@ -55,13 +55,10 @@ def begin(config: Config, folder: Path, overrides: list[str]) -> int:
 
 def resume(folder: Path) -> int:
     """Go on with an interrupted run from its checkpoint."""
-    from omegaconf import OmegaConf
-
     from styleexp import compose
 
     record = records.read_record(folder)
-    compose.register()
-    config = compose.typed(OmegaConf.create(record["config"]))
+    config = compose.recorded(record.get("config"))
     with _alone(folder):
         return _guarded(config, records.RunFolder(folder), record, resumed=True)
 
@@ -214,10 +211,13 @@ def _optimise(
 ) -> bool:
     """Take the remaining steps; False if the user stopped them."""
     optim = scene.config.optim
+    blank = 0
     with _interruptible() as interrupted:
-        for step in _progress(method.optimise(scene, state), state, optim.steps):
+        steps = _explained(method.optimise(scene, state), folder)
+        for step in _progress(steps, state, optim.steps):
             folder.append_metrics(step)
             loggers.step(step)
+            blank += getattr(step, "blank_views", 0)
             if state.step % optim.checkpoint_every == 0 or interrupted:
                 folder.save_checkpoint(state)
             if interrupted and state.step < optim.steps:
@@ -226,7 +226,26 @@ def _optimise(
                 print(f"\nstopped at step {state.step}; go on with: styleexp resume={folder.path}")
                 return False
     folder.save_checkpoint(state)
+    if blank:
+        what = "were skipped" if scene.config.loss.masked else "counted as background"
+        print(
+            f"note: {blank} views did not show the mesh and {what} (blank_views in metrics.jsonl)"
+        )
     return True
+
+
+def _explained(steps: Iterator[Step], folder: records.RunFolder) -> Iterator[Step]:
+    """The steps; where they diverge, the error also names the last good checkpoint."""
+    from styleexp.stylize import Diverged
+
+    try:
+        yield from steps
+    except Diverged as error:
+        good = folder.checkpoint_step()
+        kept = "There is no checkpoint yet."
+        if good is not None:
+            kept = f"The last good checkpoint is that of step {good}, {folder.checkpoint}."
+        raise UserError(f"{error} {kept}") from None
 
 
 def _write_results(

@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from styleexp import images
 from styleexp.errors import UserError
+from styleexp.meshes import references
 from styleexp.meshes.mesh import Carrier
 from styleexp.meshes.welding import check_indices, plural
 
@@ -44,7 +46,7 @@ def read_obj(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
             polygon = []
             for word in rest.split("#")[0].split():
                 for given, table in zip(word.split("/"), tables.values(), strict=False):
-                    value = int(given or -len(table) - 1)  # -1 from 0 where there is none
+                    value = _index(given, number) if given else -len(table) - 1  # -1 from 0: none
                     if value == 0:
                         raise UserError(
                             f"has index 0 in line {number}, but OBJ counts from 1: export it again."
@@ -62,6 +64,8 @@ def read_obj(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
             libraries.append(rest)
 
     notes: list[str] = []
+    if polygons and not data.rstrip(b" \t\0").endswith((b"\n", b"\r")):
+        notes.append("its last line has no end: if the file was cut off, faces are missing")
     positions, colors = _vertices(tables["v"])
     counts = np.array([len(polygon) // 2 for polygon in polygons], dtype=np.int64)
     index = np.array([i for polygon in polygons for i in polygon], dtype=np.int64).reshape(-1, 2)
@@ -135,9 +139,14 @@ def surface(name: str, image: Any = None, color: Any = None) -> Any:
     )
 
 
-def bare(name: str) -> str:
-    """The file's name without folders, be they written the Unix or the Windows way."""
-    return re.split(r"[/\\]", name)[-1]
+def _index(word: str, line: int) -> int:
+    try:
+        value = int(word)
+    except ValueError:
+        value = 1 << 62
+    if abs(value) >= 1 << 62:
+        raise UserError(f"has the index '{word[:20]}' in line {line}: export it again.")
+    return value
 
 
 def _text(data: bytes) -> str:
@@ -155,13 +164,31 @@ def _vertices(lines: list[list[str]]) -> tuple[np.ndarray, np.ndarray | None]:
     shortest = min(map(len, lines), default=3)
     if shortest < 3:
         raise UserError("has a vertex with fewer than three coordinates: export it again.")
-    table = np.array([line[:6] if shortest >= 6 else line[:3] for line in lines], dtype=np.float64)
+    width = 6 if shortest >= 6 else 3
+    try:
+        table = np.array([line[:width] for line in lines], dtype=np.float64)
+    except ValueError:
+        number, word = next(
+            (k, word) for k, row in enumerate(lines, 1) for word in row[:width] if not _number(word)
+        )
+        raise UserError(
+            f"has '{word[:20]}' where vertex {number} should have a number: export it again, with "
+            "decimal points."
+        ) from None
     table = table.reshape(len(lines), -1) if lines else np.zeros((0, 3))
     colors = table[:, 3:]
     if not colors.size:
         return table, None
     bytes_ = np.clip(colors * (1.0 if colors.max() > 1.0 else 255.0), 0, 255).round()
     return table[:, :3], np.insert(bytes_, 3, 255, axis=1).astype(np.uint8)
+
+
+def _number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _uv(lines: list[list[str]], chosen: np.ndarray) -> np.ndarray | None:
@@ -171,42 +198,39 @@ def _uv(lines: list[list[str]], chosen: np.ndarray) -> np.ndarray | None:
     return np.array([[*line, "0", "0"][:2] for line in [*lines, []]], dtype=np.float64)[chosen]
 
 
-def _beside(path: Path, name: str) -> Path | None:
-    """The file that ``name`` in ``path`` refers to, if there is one.
-
-    Files made elsewhere often hold an absolute or a Windows path: then the bare name is tried.
-    """
-    for candidate in (name, name.replace("\\", "/"), bare(name)):
-        with contextlib.suppress(OSError, ValueError):
-            if candidate and (path.parent / candidate).is_file():
-                return path.parent / candidate
-    return None
-
-
 def _materials(
     path: Path, libraries: list[str], notes: list[str]
 ) -> tuple[str, dict[str, bytes], dict[str, Any]]:
     """The libraries' text, the images they name, and the materials by name."""
     texts: list[str] = []
     textures: dict[str, bytes] = {}
+    pictures: dict[str, bytes] = {}  # those that can be decoded
+    root = path.parent
     for library in libraries:
         # One line may name several libraries, or one whose name has spaces.
-        for name in [library] if _beside(path, library) else library.split():
-            file = _beside(path, name)
-            if file is None:
-                notes.append(f"did not find the material library '{name}', saved without it")
+        for name in [library] if references.find(library, root, root)[0] else library.split():
+            file, reason = references.find(name, root, root)
+            content = b"" if file is None else file.read_bytes()
+            if file is None or b"\0" in content:
+                reason = reason or "is binary"
+                notes.append(f"saved without the material library '{name}': it {reason}")
                 continue
-            texts.append(_text(file.read_bytes()))
+            texts.append(_text(content))
             for wanted in dict.fromkeys(match[2] for match in MAP.finditer(texts[-1])):
-                image = _beside(file, wanted)
+                image, reason = references.find(wanted, file.parent, root)
                 if image is None:
-                    notes.append(f"did not find the texture '{wanted}', saved without it")
+                    notes.append(f"saved without the texture '{wanted}': it {reason}")
+                    continue
+                content = image.read_bytes()
+                textures.setdefault(wanted, content)
+                if fault := images.fault(content):
+                    notes.append(f"kept the texture '{wanted}' for OBJ alone: it {fault}")
                 else:
-                    textures.setdefault(wanted, image.read_bytes())
+                    pictures.setdefault(wanted, content)
     text = "\n".join(texts)
     plain = MAP.sub(lambda match: f"{match[1].split()[0]} {match[2]}", text)
     known = {}
-    for name, found in trimesh.exchange.obj.parse_mtl(plain, resolver=textures).items():
+    for name, found in trimesh.exchange.obj.parse_mtl(plain, resolver=pictures).items():
         color = np.append(np.resize(found.get("diffuse", 0.8), 3), 1.0)
         with contextlib.suppress(ValueError):
             color[3] = 1.0 - float(found["tr"][-1]) if "tr" in found else color[3]

@@ -12,11 +12,22 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from styleexp import images
 from styleexp.errors import UserError
+from styleexp.meshes import whole
 from styleexp.meshes.mesh import Carrier, Mesh
 from styleexp.meshes.obj import read_obj, surface
+from styleexp.meshes.references import Beside
 from styleexp.meshes.welding import check_indices, plural, weld
 
+TEXTURES = (
+    "baseColorTexture",
+    "emissiveTexture",
+    "metallicRoughnessTexture",
+    "normalTexture",
+    "occlusionTexture",
+)
+"""Where trimesh's ``PBRMaterial`` has pictures."""
 READABLE = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
 
 
@@ -57,8 +68,10 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
         return weld(path.stem, points, carrier, notes)
     except UserError as error:
         raise UserError(f"'{path}' {error}") from None
-    except (MemoryError, KeyboardInterrupt):
-        raise
+    except MemoryError:
+        raise UserError(
+            f"'{path}' needs more memory than there is: give a smaller mesh, or export it again."
+        ) from None
     except Exception as error:
         detail = " ".join(str(error).split())[:120]
         remedy = "as OBJ, or with triangles only" if kind == ".ply" else "with all files it needs"
@@ -71,14 +84,13 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
 def _read(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
     """The rows' positions, all else, and notes, of a format that trimesh reads."""
     kind = path.suffix.lower()[1:]
-    scene = trimesh.load_scene(
-        io.BytesIO(data),
-        file_type=kind,
-        resolver=trimesh.resolvers.FilePathResolver(str(path.absolute())),
-        process=False,
-    )
+    whole.check(kind, data)
+    resolver = Beside(path)
+    scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
     notes: list[str] = []
     gltf = kind in ("glb", "gltf")
+    if gltf:
+        _check_textures(scene, whole.gltf_header(kind, data), resolver, notes)
     nodes = _own_geometries(scene)
     if len(nodes) < len(scene.graph.nodes_geometry):
         notes.append("left out what has no faces")
@@ -149,6 +161,38 @@ def _declared_faces(kind: str, data: bytes, shape: trimesh.Trimesh) -> int:
         return shape.metadata["_ply_raw"]["face"]["length"]
     counts = re.search(rb"^(?:OFF)?[ \t]*\d+[ \t]+(\d+)", data, re.MULTILINE)
     return int(counts[1]) if kind == "off" and counts else 0
+
+
+def _check_textures(
+    scene: trimesh.Scene, header: dict[str, Any], resolver: Beside, notes: list[str]
+) -> None:
+    """Take out textures that can't be decoded: trimesh would find out when the result is saved."""
+    absent = 0
+    for image in header.get("images", ()):
+        uri = image.get("uri", "")
+        if uri and "base64," not in uri:
+            try:
+                resolver.get(uri)
+            except UserError as error:
+                absent += 1
+                notes.append(f"saved without a texture: the file {str(error).split(':')[0]}")
+    faults: dict[int, str] = {}
+    for shape in scene.geometry.values():
+        material = getattr(getattr(shape, "visual", None), "material", None)
+        for slot in TEXTURES if material is not None else ():
+            image = getattr(material, slot, None)
+            if image is None:
+                continue
+            if id(image) not in faults:
+                faults[id(image)] = images.fault_of(image)
+                if faults[id(image)]:
+                    notes.append(f"saved without a texture ({slot}): it {faults[id(image)]}")
+            if faults[id(image)]:
+                setattr(material, slot, None)
+    lost = len(header.get("images", ())) - absent - len(faults)
+    if lost > 0:
+        number = plural(lost, "texture", "textures")
+        notes.append(f"saved without {number} that no material uses or that can't be decoded")
 
 
 def _own_geometries(scene: trimesh.Scene) -> list[str]:

@@ -12,7 +12,8 @@ import trimesh
 
 from styleexp.errors import UserError
 from styleexp.meshes.mesh import Carrier, Mesh, vertex_normals
-from styleexp.meshes.obj import MAP, bare, surface
+from styleexp.meshes.obj import MAP, surface
+from styleexp.meshes.references import bare
 
 if TYPE_CHECKING:
     from jaxtyping import Float

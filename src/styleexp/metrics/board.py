@@ -91,8 +91,6 @@ def _finished(
     folder: Path,
 ) -> tuple[Config, meshes.Mesh, meshes.Mesh | np.ndarray, np.ndarray, np.ndarray]:
     """Configuration, source, style and result of a run that is done."""
-    from omegaconf import OmegaConf
-
     from styleexp import compose
 
     record = records.read_record(folder, "measure")
@@ -102,8 +100,7 @@ def _finished(
         raise UserError(f"'{folder}/status.json' cannot be read ({error}).") from error
     if status != "done":
         raise UserError(f"the run in '{folder}' is {status}, not done: there is no result yet.")
-    compose.register()
-    config = compose.typed(OmegaConf.create(record["config"]))
+    config = compose.recorded(record["config"])
     source, style = load_source(config.source), load_style(config.style)
     return config, source, style, *read_result(folder / "result.ply", source)
 

@@ -23,6 +23,8 @@ from markupsafe import Markup
 if TYPE_CHECKING:
     from PIL import Image
 
+FORMATS = ("PNG", "GIF")
+"""Of a run's pictures: Pillow must not guess another, and start a program for it."""
 GZIP_LEVEL = 6
 THUMBNAIL = 200
 """Pixels on the longer side of a sweep's small pictures."""
@@ -85,9 +87,9 @@ def picture(path: Path, longest: int) -> str | None:
     from PIL import Image
 
     try:
-        with Image.open(path) as opened:
+        with Image.open(path, formats=FORMATS) as opened:
             return data_uri(opened, longest)
-    except OSError:
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # a damaged file
         return None
 
 
@@ -99,9 +101,9 @@ def views(folder: Path, row: int) -> list[Image.Image]:
     from PIL import Image
 
     try:
-        with Image.open(folder / "preview.png") as opened:
+        with Image.open(folder / "preview.png", formats=FORMATS) as opened:
             sheet = opened.convert("L")
-    except OSError:
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
         return []
     size = sheet.width // 4
     band = max(18, size // 12)  # as `previews.sheet` does it

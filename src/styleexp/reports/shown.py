@@ -158,16 +158,13 @@ def read_moved(folder: Path) -> tuple[meshes.Mesh, np.ndarray, np.ndarray]:
 
 def _load(run: Run, missing: list[str]) -> tuple[meshes.Mesh | None, Any]:
     """Source and style of a run's record, None where they can't be had as they were."""
-    from omegaconf import OmegaConf
-
     from styleexp import compose, sources
 
     if not run.record.get("config"):
         missing.append("Source and style can't be shown: there is no readable run.json.")
         return None, None
-    compose.register()
     try:
-        config = compose.typed(OmegaConf.create(run.record["config"]))
+        config = compose.recorded(run.record["config"])
         now = sources.describe(config)
     except Exception as error:
         missing.append(f"Source and style can't be shown: {error}")
@@ -179,7 +176,7 @@ def _load(run: Run, missing: list[str]) -> tuple[meshes.Mesh | None, Any]:
     }
     found: dict[str, Any] = {}
     for kind, load in loaders.items():
-        if kind in then and then[kind].get("sha256") != now[kind]["sha256"]:
+        if (then.get(kind) or {}).get("sha256") != now[kind]["sha256"]:
             missing.append(f"The {kind} can't be shown: its file has changed since the run.")
             continue
         try:

@@ -139,16 +139,13 @@ def write_figure(jobs: Sequence[Job], folder: RunFolder) -> None:
 
 def _config(job: Job) -> Config:
     """A job's configuration, from its record or, where it never began, from its overrides."""
-    from omegaconf import OmegaConf
-
     from styleexp import compose
 
     try:
         record = json.loads((job.folder / "run.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return compose.compose([*job.overrides, "hydra.mode=RUN"])
-    compose.register()
-    return compose.typed(OmegaConf.create(record["config"]))
+    return compose.recorded(record["config"])
 
 
 def _name(part: Any) -> str:

@@ -29,6 +29,10 @@ if TYPE_CHECKING:
     from styleexp.renderers.soft_raster.raster import FacePairs, Visible
 
 
+MOST_CROSSINGS = 1 << 20
+"""Crossings held before only the outermost between each two pixels are kept: bounds memory."""
+
+
 @dataclass(frozen=True)
 class Crossings:
     """Outline edges between two neighbouring pixels, n of them."""
@@ -48,6 +52,9 @@ class Crossings:
     view: Int[Tensor, " n"]
     face: Int[Tensor, " n"]
     """The front face whose edge it is."""
+
+
+_Found = tuple[Crossings, "Tensor", "Tensor"]
 
 
 def neighbours(faces: Int[Tensor, "faces 3"], count: int) -> Int[Tensor, "3 faces"]:
@@ -101,19 +108,28 @@ def find_crossings(
     """All places where a visible contour edge separates two pixels."""
     edges = _contour_edges(points, corners, across, front, pairs)
     segments = _segments(points, edges, near, visible.depth)
-    found, distances, preferred = [], [], []
-    begin = 0
+    found: list[_Found] = []
+    begin = held = 0
     for size in chunks(segments.count):
         part = _part(segments, slice(begin, begin + size))
-        crossings, distance, best = _seen_crossings(part, visible.depth)
-        found.append(crossings)
-        distances.append(distance)
-        preferred.append(best)
+        found.append(_seen_crossings(part, visible.depth))
         begin += size
-    columns = [[getattr(crossings, f.name) for crossings in found] for f in fields(Crossings)]
+        held += len(found[-1][1])
+        if held > MOST_CROSSINGS:  # many faces in one place would otherwise fill the memory
+            found = [_outermost_of(found)]
+            held = len(found[0][1])
+    crossings, _, preferred = _outermost_of(found)
+    return _part(crossings, preferred.nonzero().view(-1))
+
+
+def _outermost_of(found: list[_Found]) -> _Found:
+    """Of crossings, their distances and whether they are preferred: those outermost, in order."""
+    columns = [[getattr(each, f.name) for each, _, _ in found] for f in fields(Crossings)]
     every = Crossings(*(torch.cat(column, dim=-1) for column in columns))
-    outermost = _outermost(every, torch.cat(distances))
-    return _part(every, outermost[torch.cat(preferred)[outermost]])
+    distance = torch.cat([each for _, each, _ in found])
+    preferred = torch.cat([each for _, _, each in found])
+    outermost = _outermost(every, distance)
+    return _part(every, outermost), distance[outermost], preferred[outermost]
 
 
 def _part(record: Any, index: slice | Tensor) -> Any:

@@ -7,7 +7,7 @@ built on this differ in; light, outlines and every gradient are theirs in common
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import torch
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from styleexp.renderers.soft_raster.raster import FacePairs, Visible
 
 VISIBILITY_GRADIENTS = ("contour", "none")
+MOST_PAIRS = 1 << 22
+"""Views times faces (or vertices) that are rendered at once without gradients: bounds memory."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,28 @@ class DeferredRenderer(Renderer):
         """All lights on what is found to be seen once; see ``Renderer.render_lights``."""
         if shading.normals not in ("flat", "smooth"):
             raise unknown_name("kind of normals", shading.normals, ("flat", "smooth"))
+        # Views don't depend on each other, so without gradients they need not be there at once.
+        at_once = max(1, MOST_PAIRS // max(faces.shape[0], vertices.shape[0], 1))
+        if len(cameras) <= at_once or (torch.is_grad_enabled() and vertices.requires_grad):
+            return self._render(vertices, faces, cameras, shading, lights, resolution)
+        parts = []
+        for start in range(0, len(cameras), at_once):
+            some = slice(start, start + at_once)
+            lit = lights[:, some]
+            parts.append(self._render(vertices, faces, cameras[some], shading, lit, resolution))
+        return RenderOutput(
+            *(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(RenderOutput))
+        )
+
+    def _render(
+        self,
+        vertices: Float[Tensor, "vertices 3"],
+        faces: Int[Tensor, "faces 3"],
+        cameras: Cameras,
+        shading: Shading,
+        lights: Float[Tensor, "lights views 3"],
+        resolution: tuple[int, int],
+    ) -> RenderOutput:
         corners = faces.t().contiguous().long()
 
         points = Project.apply(vertices, pixel_projection(cameras, resolution, vertices))

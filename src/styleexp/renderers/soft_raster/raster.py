@@ -295,7 +295,9 @@ def _test_boxes(
     inverse_w = by_x.index_select(0, (column * count).index_select(0, cell) + member)
     inverse_w += by_y.index_select(0, (row * count).index_select(0, cell) + member)
     inverse_w = torch.clamp(
-        inverse_w, lowest.index_select(0, member), highest.index_select(0, member)
+        inverse_w.nan_to_num_(),  # of a sliver's infinite slopes
+        lowest.index_select(0, member),
+        highest.index_select(0, member),
     )
     corner = (t.view.index_select(0, part) * height + top) * width + left
     pixel = corner.index_select(0, member) + (row * width + column).index_select(0, cell)
@@ -348,8 +350,9 @@ def _row_spans(t: Triangles, member: Tensor, row: Tensor, width: int) -> tuple[T
         level = edge.dy == 0
         low = torch.where(level | edge.turned, low, torch.maximum(low, crossing))
         high = torch.where(level | ~edge.turned, high, torch.minimum(high, crossing))
-    first = torch.floor(low - 1.5).clamp(0, width)
-    last = torch.ceil(high + 0.5).clamp(-1, width - 1)
+    # An edge too long for its numbers says nothing: the whole row is tested.
+    first = torch.floor(low - 1.5).nan_to_num(nan=0.0).clamp(0, width)
+    last = torch.ceil(high + 0.5).nan_to_num(nan=width - 1).clamp(-1, width - 1)
     return first.long(), (last - first + 1).clamp_min(0).long()
 
 
@@ -381,7 +384,7 @@ def _test_spans(
     by_y = slope_y * (center_y - y[0]) + first
     by_x = slope_x.index_select(0, owner) * (center_x - x[0].index_select(0, owner))
     inverse_w = torch.clamp(
-        by_x + by_y.index_select(0, owner),
+        (by_x + by_y.index_select(0, owner)).nan_to_num_(),
         lowest.index_select(0, owner),
         highest.index_select(0, owner),
     )

@@ -1,0 +1,71 @@
+"""What a configuration may have Hydra call: nothing but Hydra's parts and this package's.
+
+Hydra builds callbacks, launchers and sweepers from ``_target_``, and logging from ``()`` and
+``class``, each of which may name any function that can be imported. Configuration files get passed
+around, so what they name is looked at before any of it is built.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from styleexp.errors import UserError
+
+ALLOWED = ("hydra.", "hydra_plugins.", "styleexp.")
+CALLED = ("_target_", "()")
+LOGGING = ("logging.StreamHandler", "logging.FileHandler", "logging.NullHandler", "colorlog.")
+
+
+def guard() -> None:
+    """Have every configuration that Hydra composes in this process checked. Safe to call again.
+
+    What Hydra raises for odd overrides besides its own errors becomes a `UserError`.
+    """
+    from hydra._internal.config_loader_impl import ConfigLoaderImpl
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    real = ConfigLoaderImpl.load_configuration
+    if getattr(real, "checked", False):
+        return
+
+    def load_configuration(*arguments: Any, **options: Any) -> Any:
+        try:
+            config = real(*arguments, **options)
+        except (HydraException, OmegaConfBaseException):
+            raise
+        except Exception as error:
+            told = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+            raise UserError(f"the overrides can't be understood: {told}.") from error
+        check(config)
+        return config
+
+    load_configuration.checked = True  # type: ignore[attr-defined]
+    ConfigLoaderImpl.load_configuration = load_configuration  # type: ignore[method-assign]
+
+
+def check(config: Any) -> None:
+    """Raise `UserError` for a function or class that a configuration must not name."""
+    from omegaconf import OmegaConf
+
+    for key, value in _named(OmegaConf.to_container(config, resolve=False)):
+        last = key.rsplit(".", 1)[-1]
+        allowed = ALLOWED if last == "_target_" else LOGGING if last == "class" else ()
+        if not isinstance(value, str) or not value.startswith(allowed):
+            raise UserError(
+                f"the configuration has {key}={value}, which would run code that is not this "
+                "package's: remove it; parts of your own are plugins (docs/write-a-backend.md)."
+            )
+
+
+def _named(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Keys and values of what would be called."""
+    for name, value in node.items() if isinstance(node, dict) else ():
+        full = f"{key}.{name}" if key else str(name)
+        in_logging = "logging" in key.split(".", 2)[:2][-1]
+        if name in CALLED or (name == "class" and in_logging):
+            yield full, value
+        yield from _named(value, full)
+    for number, value in enumerate(node) if isinstance(node, list) else ():
+        yield from _named(value, f"{key}.{number}")
