@@ -1,0 +1,113 @@
+"""The least time that the encoder's convolutions can take here, measured in the same process.
+
+Two floors. ``floor``: their multiplications at the best rate that any product or convolution tried
+here reaches; nothing but arithmetic. ``convolutions``: each convolution alone, forward and gradient
+of its input, with nothing else in the caches; what is left above it are ReLU, pooling, copies.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+
+from styleexp.bench.measuring import interleaved
+
+if TYPE_CHECKING:
+    from styleexp.encoders.vgg import Encoder
+
+Shape = tuple[int, int, int, int, int]
+"""Images, channels in, channels out, height, width of a 3x3 convolution that keeps the size."""
+Call = tuple[tuple[int, ...], tuple[str, ...], bool]
+"""Of an encoder: shape of the images, layers, whether gradients are taken."""
+PRODUCT = 2048
+"""Rows and columns of the matrix product that is tried."""
+
+
+@dataclass(frozen=True)
+class Floor:
+    """All in CPU seconds a step, but for the rates."""
+
+    flops: float
+    """Floating-point operations of the convolutions, forward and, where taken, backward."""
+    rates: dict[str, float]
+    """Operations a CPU second: of the matrix product, and of the best convolution."""
+    convolutions: float
+    """Each convolution alone, added up."""
+
+    @property
+    def seconds(self) -> float:
+        """The operations at the best rate."""
+        return self.flops / max(self.rates.values())
+
+
+def encoder_floor(encoder: Encoder, calls: Iterable[Call], repeats: int = 3) -> Floor:
+    """The floor of a step in which the encoder is called like that."""
+    forward: Counter[Shape] = Counter()
+    backward: Counter[Shape] = Counter()
+    for images, layers, gradients in calls:
+        for shape in convolutions(encoder, images, layers):
+            forward[shape] += 1
+            backward[shape] += gradients
+    weight = next(encoder.convs.parameters())
+    work: dict[object, Callable[[], object]] = {}
+    for shape in forward:
+        ahead, back = _convolution(shape, weight)
+        work[shape, False] = ahead
+        if backward[shape]:
+            work[shape, True] = back
+    square = torch.randn(PRODUCT, PRODUCT, device=weight.device).to(weight.dtype)
+    work["product"] = lambda: square @ square
+    # The least time, not the median: what is looked for is what the machine can do.
+    best = {key: min(times.cpu) for key, times in interleaved(work, repeats).items()}
+    counts = {(s, False): n for s, n in forward.items()} | {(s, True): n for s, n in backward.items()}
+    counts = {key: n for key, n in counts.items() if n}
+    return Floor(
+        sum(n * operations(shape) for (shape, _), n in counts.items()),
+        {
+            "product": 2 * PRODUCT**3 / best["product"],
+            "convolution": max(operations(key[0]) / best[key] for key in counts),
+        },
+        sum(n * best[key] for key, n in counts.items()),
+    )
+
+
+def convolutions(encoder: Encoder, images: tuple[int, ...], layers: Iterable[str]) -> list[Shape]:
+    """The convolutions of a forward pass, up to the deepest layer."""
+    deepest = max(layers, key=encoder.layer_names.index)
+    names = encoder.layer_names[: encoder.layer_names.index(deepest) + 1]
+    found = []
+    for name in names:
+        out, into = encoder.convs[name].weight.shape[:2]
+        stride = encoder.stride(name)
+        found.append((images[0], into, out, images[2] // stride, images[3] // stride))
+    return found
+
+
+def operations(shape: Shape) -> float:
+    """Two for each multiplication and addition."""
+    images, into, out, height, width = shape
+    return 2.0 * 9 * images * into * out * height * width
+
+
+def _convolution(shape: Shape, like: torch.Tensor) -> tuple[Callable[[], object], ...]:
+    images, into, out, height, width = shape
+    last = {"memory_format": torch.channels_last}
+    x = torch.randn(images, into, height, width, device=like.device).to(like.dtype, **last)
+    grad = torch.randn(images, out, height, width, device=like.device).to(like.dtype, **last)
+    weight = torch.randn(out, into, 3, 3, device=like.device).to(like.dtype, **last)
+    one = [1, 1]
+
+    def ahead() -> object:
+        return torch.nn.functional.conv2d(x, weight, padding=1)
+
+    def back() -> object:
+        wanted = [True, False, False]
+        return torch.ops.aten.convolution_backward(
+            grad, x, weight, None, one, one, one, False, [0, 0], 1, wanted
+        )
+
+    return ahead, back

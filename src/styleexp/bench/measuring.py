@@ -1,0 +1,102 @@
+"""Clocks, peak memory, and the machine that was measured on.
+
+Two times are taken of everything. Wall time is what a user feels; on a machine that others use, too,
+it measures them as well. CPU time is the process's own: with one thread it hardly changes when the
+machine is busy. Numbers of one process, taken in turns, make a ratio that holds on either.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import resource
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+
+
+@dataclass(frozen=True)
+class Times:
+    """Seconds of each repeat."""
+
+    wall: list[float]
+    cpu: list[float]
+
+    @property
+    def ms(self) -> float:
+        """Median of the wall times, in milliseconds."""
+        return 1e3 * median(self.wall)
+
+    @property
+    def cpu_ms(self) -> float:
+        """Median of the CPU times of all threads together, in milliseconds."""
+        return 1e3 * median(self.cpu)
+
+
+def interleaved(contenders: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, Times]:
+    """Run the contenders in turns, ``repeats`` times each, after once for nothing."""
+    for run in contenders.values():
+        run()
+    times: dict[str, Times] = {name: Times([], []) for name in contenders}
+    for _ in range(repeats):
+        for name, run in contenders.items():
+            wall, cpu = time.perf_counter(), time.process_time()
+            run()
+            times[name].wall.append(time.perf_counter() - wall)
+            times[name].cpu.append(time.process_time() - cpu)
+    return times
+
+
+def ratio(slower: list[float], faster: list[float]) -> float:
+    """Median of the ratios of the repeats, which ran side by side."""
+    return median(a / b for a, b in zip(slower, faster, strict=True))
+
+
+def peak_memory_mb(run: Callable[[], object]) -> float:
+    """Most memory that the process holds during ``run``, in MB, with all that it held before.
+
+    Where the system can't start counting anew (all but Linux), the peak since the process began.
+    """
+    anew = os.access(CLEAR, os.W_OK)
+    if anew:
+        CLEAR.write_text("5")
+    run()
+    if anew:
+        peak = next(x for x in STATUS.read_text().splitlines() if x.startswith("VmHWM"))
+        return int(peak.split()[1]) / 1024
+    unit = 1 if platform.system() == "Darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
+
+
+def machine() -> dict[str, Any]:
+    """What a reader needs to know to compare numbers with ours."""
+    import torch
+
+    gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "amx": torch.cpu._is_amx_tile_supported(),
+        "avx512_bf16": torch.cpu._is_avx512_bf16_supported(),
+        "gpus": gpus,
+        "load": round(os.getloadavg()[0], 1),
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "threads": torch.get_num_threads(),
+        "omp_wait_policy": os.environ.get("OMP_WAIT_POLICY"),
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor()

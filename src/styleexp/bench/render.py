@@ -1,0 +1,202 @@
+"""A render and its gradient, by our renderers and by others', in turns in one process."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from styleexp import meshes, shapes
+from styleexp.bench import peers
+from styleexp.bench.measuring import Times, interleaved, peak_memory_mb, ratio
+from styleexp.bench.parts import STAGES, Parts, timed_stages
+from styleexp.plugins import build, find
+from styleexp.renderers.base import Shading
+from styleexp.renderers.soft_raster import raster
+from styleexp.views import orbit
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+    from torch import Tensor
+
+    from styleexp.renderers.base import Cameras, Renderer
+
+DISTANCE, FOV = 2.2, 60.0
+"""Of the cameras, in radii and degrees: the unit sphere fills most of the frame."""
+
+LIGHT = (0.0, 0.0, 0.7)
+"""From the camera: where light falls at a grazing angle, renderers cut it off differently."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is rendered: every contender gets the same. On the CPU; in the unit sphere."""
+
+    vertices: Float[Tensor, "vertices 3"]
+    faces: Int[Tensor, "faces 3"]
+    cameras: Cameras
+    shading: Shading
+    resolution: int
+    weights: Float[Tensor, "views height width"]
+    """The gradient of the loss by the image."""
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What a contender gives back, to see that it did the same work."""
+
+    image: Float[np.ndarray, "views height width"]
+    gradient: Float[np.ndarray, "vertices 3"]
+
+
+Contender = Callable[[], Rendered]
+
+
+def make_task(name: str, faces: int, views: int, resolution: int) -> Task:
+    """The mesh of an analytic style, seen from all around, smoothly shaded."""
+    mesh = shapes.make(name, faces // 2 + 2)
+    points = meshes.normalisation(mesh.vertices).apply(mesh.vertices)
+    generator = torch.Generator().manual_seed(0)
+    elevation = (torch.rand(views, generator=generator) - 0.5) * math.pi / 2
+    azimuth = torch.arange(views) * (2 * math.pi / views)
+    # A smooth gradient, as an encoder's is; of noise, only what a renderer does within a pixel
+    # would tell.
+    coarse = torch.randn(views, 1, 8, 8, generator=generator)
+    size = (resolution, resolution)
+    weights = torch.nn.functional.interpolate(coarse, size, mode="bicubic")[:, 0]
+    return Task(
+        torch.from_numpy(points).float(),
+        torch.from_numpy(mesh.faces).long(),
+        orbit(elevation, azimuth, DISTANCE, FOV),
+        Shading(normals="smooth", background=1.0, outlines=True, light=LIGHT),
+        resolution,
+        weights,
+    )
+
+
+def ours(task: Task, name: str, device: torch.device) -> Contender:
+    """One of our backends, forward and backward."""
+    renderer: Renderer = build("renderer", find("renderer", name).spec.config(name=name))
+    if device.type not in renderer.capabilities.devices:
+        device = torch.device("cpu")
+    vertices = task.vertices.to(device, copy=True).requires_grad_()
+    faces, weights = task.faces.to(device), task.weights.to(device)
+
+    def run() -> Rendered:
+        vertices.grad = None
+        size = (task.resolution, task.resolution)
+        out = renderer.render(vertices, faces, task.cameras, task.shading, size)
+        grey = out.image.mean(-1)
+        (grey * weights).sum().backward()
+        assert vertices.grad is not None
+        return Rendered(grey.detach().cpu().numpy(), vertices.grad.cpu().numpy())
+
+    return run
+
+
+def measure(task: Task, names: Sequence[str], device: torch.device, repeats: int) -> dict[str, Any]:
+    """Time ``names``, the first being the one that the others are compared with."""
+    contenders = {
+        name: peers.PEERS[name](task) if name in peers.PEERS else ours(task, name, device)
+        for name in names
+    }
+    memory = {name: peak_memory_mb(run) for name, run in contenders.items()}
+    seen = {name: run() for name, run in contenders.items()}
+    times = interleaved(contenders, repeats)
+    first = names[0]
+    row: dict[str, Any] = {
+        "renderer": first,
+        "device": str(device),
+        "faces": len(task.faces),
+        "views": len(task.cameras),
+        "resolution": task.resolution,
+        "coverage": float((seen[first].image != task.shading.background).mean()),
+        **_times("ours", times[first]),
+        "peak_memory_mb": memory[first],
+    }
+    for name in names[1:]:
+        told = {
+            "peer": name,
+            **_times("peer", times[name]),
+            "ratio": ratio(times[name].wall, times[first].wall),
+            "ratio_cpu": ratio(times[name].cpu, times[first].cpu),
+            "peer_peak_memory_mb": memory[name],
+            "image_difference": float(np.abs(seen[name].image - seen[first].image).mean()),
+            "gradient_cosine": _cosine(seen[name].gradient, seen[first].gradient),
+        }
+        if len(names) == 2:
+            row |= told
+        else:
+            row.setdefault("peers", []).append(told)
+    if first == "soft_raster":
+        row |= {"candidates": count_candidates(task), "parts_cpu_ms": parts(task, device, repeats)}
+    return row
+
+
+def sweep(
+    mesh: str,
+    sizes: Sequence[tuple[int, int, int]],
+    names: Sequence[str],
+    devices: Sequence[torch.device],
+    repeats: int,
+) -> Iterator[dict[str, Any]]:
+    """A row for each (faces, views, resolution) and device."""
+    task, made = None, None
+    for faces, views, resolution in sizes:
+        if made != (faces, views, resolution):
+            task, made = make_task(mesh, faces, views, resolution), (faces, views, resolution)
+        assert task is not None
+        for device in devices:
+            yield measure(task, names, device, repeats)
+
+
+def parts(task: Task, device: torch.device, repeats: int) -> dict[str, float]:
+    """CPU milliseconds of a render's parts; medians, which needn't sum exactly to the whole's."""
+    clock = Parts(device)
+    run = ours(task, "soft_raster", device)
+    rows = []
+    with timed_stages(clock, STAGES):
+        run()
+        for _ in range(repeats):
+            clock.begin()
+            run()
+            rows.append(clock.end())
+    names = {name for row in rows for name in row}
+    medians = {n: float(np.median([row[n][1] if n in row else 0.0 for row in rows])) for n in names}
+    return {name: 1e3 * medians[name] for name in sorted(medians, key=lambda n: -medians[n])}
+
+
+def count_candidates(task: Task) -> int:
+    """Pairs of a face and a pixel centre that the rasteriser tests."""
+    found = 0
+    boxes, spans = raster._test_boxes, raster._test_spans
+
+    def count_boxes(*given: Any) -> None:
+        nonlocal found
+        part, size, frame = given[2], given[5], given[6]
+        found += part.numel() * min(size, frame[0]) * min(size, frame[1])
+        boxes(*given)
+
+    def count_spans(*given: Any) -> None:
+        nonlocal found
+        found += int(given[5].sum())
+        spans(*given)
+
+    try:
+        raster._test_boxes, raster._test_spans = count_boxes, count_spans
+        ours(task, "soft_raster", torch.device("cpu"))()
+    finally:
+        raster._test_boxes, raster._test_spans = boxes, spans
+    return found
+
+
+def _times(whose: str, times: Times) -> dict[str, float]:
+    return {f"{whose}_ms": times.ms, f"{whose}_cpu_ms": times.cpu_ms}
+
+
+def _cosine(a: np.ndarray, b: np.ndarray) -> float:
+    return float((a * b).sum() / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-30))

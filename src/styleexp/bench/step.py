@@ -1,0 +1,162 @@
+"""Where a step of an optimisation spends its time, by part, and how far that is from the least."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import torch
+
+from styleexp import baselines
+from styleexp.bench.floor import Call, encoder_floor
+from styleexp.bench.measuring import machine, peak_memory_mb
+from styleexp.bench.parts import BACKWARD, NORMALS, OTHER, Parts, timed_stages
+from styleexp.compose import compose
+from styleexp.encoders import Encoder
+from styleexp.errors import UserError
+from styleexp.records import RunFolder
+from styleexp.scene import Scene
+
+FORWARD = (
+    "field",
+    "normals",
+    "render",
+    "image views",
+    "encoder",
+    "loss",
+    "target",
+    "optimiser",
+    "logging",
+)
+PARTS = tuple(name + end for name in FORWARD for end in ("", BACKWARD))
+"""In the order of a step; those without a backward pass never show one."""
+
+
+class _Timed:
+    """Something callable as a part, with all that it has."""
+
+    def __init__(self, clock: Parts, name: str, inner: Any) -> None:
+        self._inner, self._call = inner, clock.timed(name, inner)
+
+    def __call__(self, *given: Any) -> Any:
+        return self._call(*given)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._inner, name)
+
+
+def measure(overrides: Sequence[str], steps: int) -> dict[str, Any]:
+    """Take ``steps`` steps after two for nothing, with the overrides of ``styleexp``."""
+    config = compose(overrides)
+    if config.threads:
+        torch.set_num_threads(config.threads)
+    method = baselines.method(config)
+    scene = method.prepare(config)
+    state = method.start(scene)
+    if state is None or not isinstance(scene, Scene):
+        raise UserError("this method has no steps of the style loss: choose method=robust or paper.")
+    config.optim.steps = max(config.optim.steps, steps + 2)
+    device = scene.surface.vertices.device
+
+    clock, calls = Parts(device), _note_calls(scene.loss.encoder)
+    clock.wrap("field", state, "field")
+    clock.wrap("field", state.field, "encode")
+    clock.wrap("render", scene.viewer.renderer, "render")
+    clock.wrap("encoder", scene.loss, "encoder")
+    for name in ("grams", "distance"):
+        clock.wrap("loss", scene.loss, name)
+    for name in ("step", "zero_grad"):
+        clock.wrap("optimiser", state.optimizer, name)
+    views, target = (
+        _Timed(clock, "image views", scene.viewer),
+        _Timed(clock, "target", scene.target),
+    )
+    timed = replace(scene, viewer=views, target=target)  # type: ignore[arg-type]
+
+    rows: list[dict[str, tuple[float, float]]] = []
+    with tempfile.TemporaryDirectory() as name, timed_stages(clock, NORMALS):
+        folder = RunFolder(Path(name))
+        loop = method.optimise(timed, state)
+        log = clock.timed("logging", lambda step: _log(folder, step, state, config))
+
+        def take(count: int) -> None:
+            for _ in range(count):
+                calls.clear()
+                clock.begin()
+                log(next(loop))
+                rows.append(clock.end())
+
+        take(2)
+        peak = peak_memory_mb(lambda: take(steps))
+    rows = rows[2:]
+    return _told(rows, scene, calls, config) | {"peak_memory_mb": peak}
+
+
+def _log(folder: RunFolder, step: Any, state: Any, config: Any) -> None:
+    """What a run writes."""
+    folder.append_metrics(step)
+    if state.step % config.optim.checkpoint_every == 0:
+        folder.save_checkpoint(state)
+
+
+def _note_calls(encoder: Any) -> list[Call]:
+    """A list that each call of the encoder is added to."""
+    calls: list[Call] = []
+    if isinstance(encoder, Encoder):
+        encoder.register_forward_pre_hook(
+            lambda _, given: calls.append(
+                (tuple(given[0].shape), tuple(given[1]), given[0].requires_grad)
+            )
+        )
+    return calls
+
+
+def _told(rows: list[Any], scene: Scene, calls: list[Call], config: Any) -> dict[str, Any]:
+    names = [name for name in (*PARTS, OTHER) if any(name in row for row in rows)]
+    names += sorted({name for row in rows for name in row} - set(names))
+    wall, cpu = (
+        {name: 1e3 * median(row.get(name, (0, 0))[i] for row in rows) for name in names}
+        for i in (0, 1)
+    )
+    step_wall, step_cpu = (
+        1e3 * median(sum(each[i] for each in row.values()) for row in rows) for i in (0, 1)
+    )
+    encoder = scene.loss.encoder
+    told: dict[str, Any] = {
+        "step_ms": step_wall,
+        "step_cpu_ms": step_cpu,
+        "parts_ms": wall,
+        "parts_cpu_ms": cpu,
+        "encoder_share": _share(wall, "encoder", step_wall),
+        "encoder_share_cpu": _share(cpu, "encoder", step_cpu),
+        "field_share": _share(wall, "field", step_wall),
+        "field_share_cpu": _share(cpu, "field", step_cpu),
+    }
+    if calls and scene.surface.vertices.device.type == "cpu":
+        floor = encoder_floor(encoder, calls)
+        spent = cpu["encoder"] + cpu.get(f"encoder{BACKWARD}", 0.0)
+        told |= {
+            "encoder_over_floor": spent / (1e3 * floor.seconds),
+            "encoder_over_convolutions": spent / (1e3 * floor.convolutions),
+            "encoder_gflop": floor.flops / 1e9,
+            "gflop_per_cpu_second": {k: v / 1e9 for k, v in floor.rates.items()},
+        }
+    return told | {
+        "vertices": len(scene.surface.vertices),
+        "faces": len(scene.surface.faces),
+        "views": [list(shape[:3:2]) for shape, _, _ in calls],
+        "steps": len(rows),
+        "encoder": config.encoder.name,
+        "dtype": getattr(encoder, "precision", "fp32"),
+        "device": str(scene.surface.vertices.device),
+        "threads": torch.get_num_threads(),
+        "machine": machine(),
+    }
+
+
+def _share(parts: dict[str, float], name: str, whole: float) -> float:
+    return (parts.get(name, 0.0) + parts.get(f"{name}{BACKWARD}", 0.0)) / whole
