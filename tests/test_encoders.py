@@ -3,11 +3,13 @@
 import os
 import subprocess
 import sys
+import weakref
 
 import numpy as np
 import pytest
 import torch
 from torch.nn import functional
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from styleexp import assets
 from styleexp.encoders import ENCODERS, Encoder, load_encoder, vgg, weights
@@ -158,31 +160,61 @@ def test_grey_is_three_equal_channels():
         torch.testing.assert_close(one[name], three[name])
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_fused_convolutions_are_those_apart(dtype):
-    conv = torch.nn.Conv2d(16, 32, 3, padding=1).to(dtype, memory_format=torch.channels_last)
-    conv.requires_grad_(False)
-    given = torch.randn(2, 16, 20, 18).to(dtype, memory_format=torch.channels_last)
-    weigh = torch.randn(2, 32, 20, 18).to(dtype)
+@pytest.mark.parametrize("pooling", ["max", "avg"])
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+@pytest.mark.parametrize("layers", [PAPER, ["conv1_2", "conv3_4", "conv3_1"]])
+def test_fused_is_one_operation_after_another(precision, pooling, layers):
+    encoder = build(precision=precision, pooling=pooling)
+    names = encoder.resolve(layers)
+    run = encoder.layer_names[: encoder.layer_names.index(max(names)) + 1]
+    dtype = next(encoder.convs.parameters()).dtype
     results = []
-    for layer in (lambda x: vgg._FusedConvRelu.apply(x, conv.weight, conv.bias),
-                  lambda x: conv(x).relu()):  # fmt: skip
-        x = given.clone().requires_grad_()
-        out = layer(x)
-        (out * weigh).sum().backward()
-        results.append((out, x.grad))
-    limit = 1e-5 if dtype == torch.float32 else 0.02
-    for fused, apart in zip(*results, strict=True):
+    for apart in (False, True):
+        given = images().requires_grad_()
+        x = ((given - encoder.mean) / encoder.std).to(dtype, memory_format=torch.channels_last)
+        served = encoder._plain(x, run) if apart else encoder(given, names)
+        weigh = torch.Generator().manual_seed(1)
+        total = sum(
+            (served[n] * torch.randn(served[n].shape, generator=weigh).to(dtype)).float().mean()
+            for n in names
+        )
+        total.backward()
+        results.append(([served[n] for n in names], given.grad))
+    limit = 1e-5 if precision == "fp32" else 0.02
+    for fused, apart in zip(results[0][0], results[1][0], strict=True):
         torch.testing.assert_close(fused, apart, rtol=limit, atol=limit)
+    fused, apart = (gradient.flatten().double() for _, gradient in results)
+    assert torch.cosine_similarity(fused, apart, dim=0) > 1 - 1e-3
+    assert fused.norm() / apart.norm() == pytest.approx(1, abs=0.01)
 
 
-def test_runs_once_and_stops_at_the_deepest_layer(monkeypatch):
-    encoder, ran, real = tiny(), [], vgg._conv_relu
-    names = {conv: name for name, conv in encoder.convs.items()}
-    monkeypatch.setattr(vgg, "_conv_relu", lambda x, conv: ran.append(names[conv]) or real(x, conv))
-    served = encoder(images(), ["conv3_1", "conv1_2"])
+def test_activations_are_freed_with_the_backward_pass_or_the_features():
+    encoder = build()
+    given = images().requires_grad_()
+    served = encoder(given, PAPER)
+    kept = weakref.ref(served["conv5_1"].grad_fn)
+    served["conv5_1"].sum().backward(retain_graph=True)
+    with pytest.raises(RuntimeError, match="no second backward"):
+        served["conv5_1"].sum().backward()
+    served = encoder(given, PAPER)
+    unused = weakref.ref(served["conv5_1"].grad_fn)
+    del served
+    assert unused() is None
+    assert kept() is None
+
+
+def test_runs_once_and_stops_at_the_deepest_layer():
+    class Count(TorchDispatchMode):
+        convolutions = 0
+
+        def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+            self.convolutions += "convolution" in str(function)
+            return function(*args, **(kwargs or {}))
+
+    with Count() as count:
+        served = tiny()(images(), ["conv3_1", "conv1_2"])
     assert list(served) == ["conv3_1", "conv1_2"]
-    assert ran == ["conv1_1", "conv1_2", "conv2_1", "conv2_2", "conv3_1"]
+    assert count.convolutions == len(["conv1_1", "conv1_2", "conv2_1", "conv2_2", "conv3_1"])
 
 
 def test_frozen():
