@@ -35,6 +35,37 @@ def test_progressive_opening_goes_from_low_to_high_frequencies():
     assert half[:3].tolist() == pytest.approx([0.37] * 3)  # the raw input is never closed
 
 
+def test_encoding_follows_points_and_frequencies_that_change_in_place():
+    encode = FourierFeatures(4, 5.0, False, generator())
+    points = torch.rand(3, 3, generator=generator())
+    first = encode(points)
+    assert encode(points) is first
+    points.add_(0.5)
+    moved = encode(points)
+    assert not torch.equal(moved, first)
+    encode.load_state_dict({"frequencies": torch.ones(4, 3)})
+    assert not torch.equal(encode(points), moved)
+    assert encode(points.clone().requires_grad_()).requires_grad
+
+
+@pytest.mark.parametrize("rows", [1, 300])
+def test_bf16_layers_are_those_of_torch(rows):
+    field = DisplacementField(FieldConfig(width=64, depth=4), generator(), 5.0, 0.1)
+    torch.nn.init.normal_(field.last.weight, generator=generator())
+    encoded = field.encode(torch.rand(rows, 3, generator=generator()))
+    field(encoded, torch.bfloat16).sum().backward()
+    fused = [layer.weight.grad.clone() for layer in field.hidden]
+    field.zero_grad()
+    x = encoded.bfloat16()
+    for layer in field.hidden:
+        x = torch.relu(torch.nn.functional.linear(x, layer.weight.bfloat16(), layer.bias.bfloat16()))
+    expected = field.bound * torch.tanh(field.last(x.float()).squeeze(-1))
+    torch.testing.assert_close(field(encoded, torch.bfloat16), expected)
+    expected.sum().backward()
+    for gradient, layer in zip(fused, field.hidden, strict=True):
+        torch.testing.assert_close(gradient, layer.weight.grad, rtol=0.02, atol=1e-4)
+
+
 def test_starts_at_the_source_and_keeps_its_bound():
     field = DisplacementField(FieldConfig(), generator(), 5.0, 0.1)
     encoded = field.encode(torch.rand(50, 3))

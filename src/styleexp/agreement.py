@@ -109,7 +109,7 @@ def held_out_losses(
     target, loss = scene.target(styles.BANK_STEP), scene.loss
 
     def measure(vertices: torch.Tensor) -> float:
-        grams = styles.mesh_target(loss, scene.viewer, vertices)(0)
+        grams = styles.mesh_grams(loss, scene.viewer, vertices)
         parts = [
             float(loss.distance(*each)) for each in zip(grams, target, scene.scales, strict=True)
         ]

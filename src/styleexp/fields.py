@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 
     from styleexp.config import FieldConfig
 
+REMEMBERED = 1 << 25
+"""Most numbers of an encoding that are kept for the next step: 128 MB."""
+
 
 class FourierFeatures(nn.Module):
     """Random Fourier features, gamma(v) = [cos 2 pi B v, sin 2 pi B v] (Eq. 1).
@@ -35,16 +38,25 @@ class FourierFeatures(nn.Module):
         self.register_buffer("frequencies", frequencies[order])
         self.include_input = include_input
         self.size = 2 * features + (3 if include_input else 0)
+        self._known: tuple[Any, Tensor, Tensor, Tensor] | None = None
 
     def forward(
         self, points: Float[Tensor, "vertices 3"], opened: float = 1.0
     ) -> Float[Tensor, "vertices size"]:
         """Encode points; ``opened`` in [0, 1] is the share of bands that are let through."""
-        phase = 2 * math.pi * points @ self.frequencies.T
-        rows = self.frequencies.shape[0]
-        window = (opened * rows - torch.arange(rows, device=points.device)).clamp(0, 1)
-        bands = [phase.cos() * window, phase.sin() * window]
-        return torch.cat([points, *bands] if self.include_input else bands, dim=1)
+        # A run encodes the same points in every step.
+        frequencies = self.frequencies
+        key = (id(points), points._version, id(frequencies), frequencies._version, opened)
+        if self._known is None or self._known[0] != key:
+            phase = 2 * math.pi * points @ frequencies.T
+            rows = frequencies.shape[0]
+            window = (opened * rows - torch.arange(rows, device=points.device)).clamp(0, 1)
+            bands = [phase.cos() * window, phase.sin() * window]
+            encoded = torch.cat([points, *bands] if self.include_input else bands, dim=1)
+            if points.requires_grad or encoded.numel() > REMEMBERED:
+                return encoded
+            self._known = (key, points, frequencies, encoded)  # held, so that no other has their id
+        return self._known[3]
 
 
 class DisplacementField(nn.Module):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from styleexp import meshes, styles
+from styleexp import meshes, remembered, styles
 from styleexp.config import check
 from styleexp.errors import UserError
 from styleexp.geometry import Surface, vertex_areas
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from styleexp.config import Config, FieldConfig, StyleConfig
-    from styleexp.losses import StyleLoss
+    from styleexp.losses import Grams, StyleLoss
     from styleexp.renderers.base import Renderer
     from styleexp.styles import StyleTarget
 
@@ -120,21 +120,32 @@ def prepare(config: Config) -> Scene:
     loss = build("loss", config.loss, encoder=encoder)
     lights = config.shading.lights if isinstance(style, meshes.Mesh) else 1
     viewer = Viewer(config, renderer, shading, surface, lights=lights)
+
+    def measured(mesh: Surface, scale: float) -> styles.FixedTarget:
+        """Grams over a bank of views; those of a run with the same are still known."""
+        about = [mesh.vertices, mesh.faces, scale, lights, shading, str(device)]
+
+        def make() -> tuple[Grams, Grams]:
+            seen = Viewer(config, renderer, shading, mesh, scale, lights)
+            return styles.mesh_grams(loss, seen, mesh.vertices)
+
+        return styles.FixedTarget(*remembered.grams(config, encoder, about, make))
+
     target: StyleTarget
     if isinstance(style, meshes.Mesh):
         _, styled = normalised(style, device)
-        style_viewer = Viewer(config, renderer, shading, styled, unit, lights)
         if config.loss.target != "bank":
+            style_viewer = Viewer(config, renderer, shading, styled, unit, lights)
             target = styles.SameViewsTarget(loss, style_viewer, styled.vertices)
         else:
-            target = styles.mesh_target(loss, style_viewer, styled.vertices)
+            target = measured(styled, unit)
     else:
         picture = styles.tone(torch.from_numpy(style).to(device), grey, config.style)
         if config.loss.target != "bank":
-            target = styles.FixedTarget(loss, styles.whole_image_bank(picture, config))
+            target = styles.FixedTarget(*styles.mean_grams(loss, styles.whole_image_bank(picture, config)))
         else:
-            target = styles.FixedTarget(loss, styles.image_bank(picture, config, unit))
-    goal, own = target(0), styles.mesh_target(loss, viewer, surface.vertices)(0)
+            target = styles.FixedTarget(*styles.mean_grams(loss, styles.image_bank(picture, config, unit)))
+    goal, own = target(0), measured(surface, 1.0)(0)
     for what, grams in (("source", own), ("style", goal)):
         if not any(bool(gram.any()) for part in grams for gram in part):
             raise UserError(

@@ -34,12 +34,10 @@ class StyleTarget(Protocol):
 
 
 class FixedTarget:
-    """Grams averaged once over a bank of views of the style."""
+    """The same Grams in every step: averages over a bank of views of the style."""
 
-    def __init__(self, loss: StyleLoss, batches: Iterator[tuple[Images, Images]]):
-        with torch.no_grad():
-            pairs = [(loss.grams(whole), loss.grams(local)) for whole, local in batches]
-        self.grams = _mean([g for g, _ in pairs]), _mean([g for _, g in pairs])
+    def __init__(self, whole: Grams, local: Grams):
+        self.grams = whole, local
 
     def __call__(self, step: int) -> tuple[Grams, Grams]:
         """The same for every step."""
@@ -59,12 +57,21 @@ class SameViewsTarget:
         return self.loss.grams(whole), self.loss.grams(local)
 
 
-def mesh_target(
+def mean_grams(
+    loss: StyleLoss, batches: Iterator[tuple[Images, Images]]
+) -> tuple[Grams, Grams]:
+    """Grams of global and of local views, averaged over batches."""
+    with torch.no_grad():
+        pairs = [(loss.grams(whole), loss.grams(local)) for whole, local in batches]
+    return _mean([g for g, _ in pairs]), _mean([g for _, g in pairs])
+
+
+def mesh_grams(
     loss: StyleLoss, viewer: Viewer, vertices: Float[Tensor, "vertices 3"]
-) -> FixedTarget:
+) -> tuple[Grams, Grams]:
     """Grams of a mesh, averaged over a bank of its views."""
     batches = max(1, round(loss.config.bank_views / viewer.config.count))
-    return FixedTarget(loss, (viewer(vertices, BANK_STEP + batch) for batch in range(batches)))
+    return mean_grams(loss, (viewer(vertices, BANK_STEP + batch) for batch in range(batches)))
 
 
 def image_bank(

@@ -65,7 +65,8 @@ def measure(overrides: Sequence[str], steps: int) -> dict[str, Any]:
     clock, calls = Parts(device), _note_calls(scene.loss.encoder)
     clock.wrap("field", state, "field")
     clock.wrap("field", state.field, "encode")
-    clock.wrap("render", scene.viewer.renderer, "render")
+    for name in ("render", "render_lights"):
+        clock.wrap("render", scene.viewer.renderer, name)
     clock.wrap("encoder", scene.loss, "encoder")
     for name in ("grams", "distance"):
         clock.wrap("loss", scene.loss, name)

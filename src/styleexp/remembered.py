@@ -1,0 +1,106 @@
+"""Target Gram matrices of earlier runs, so that a run like one before starts its steps sooner.
+
+Measuring the style, and the source as it is, takes as long as a dozen steps, and most runs of a study
+share it. A file is found by a digest of all that went into it: meshes, options, weights, the code
+itself, torch, threads. What it holds are the bits that would be computed; where there is none, or it
+can't be read, they are.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from styleexp import assets, plugins
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from styleexp.config import Config
+    from styleexp.encoders import Encoder
+    from styleexp.losses import Grams
+
+KEPT = 40
+"""Files, of 5 MB each; the longest unused go first."""
+
+
+def grams(
+    config: Config, encoder: Encoder, about: list[object], make: Callable[[], tuple[Grams, Grams]]
+) -> tuple[Grams, Grams]:
+    """What ``make`` returns, from the cache if it was made before.
+
+    ``about`` is what else it depends on: tensors, or what ``repr`` tells apart. Parts from plugins,
+    whose code isn't ours to know, are always made anew.
+    """
+    parts = (("renderer", config.renderer), ("encoder", config.encoder), ("loss", config.loss))
+    own = all(plugins.find(kind, part.name).origin == plugins.OWN for kind, part in parts)
+    if not own or config.loss.name != "gram":
+        return make()
+    path = assets.cache_dir() / "grams" / f"{_digest(config, encoder, about)}.safetensors"
+    found = _read(path, encoder)
+    if found is None:
+        found = make()
+        _write(path, found)
+    return found
+
+
+def _digest(config: Config, encoder: Encoder, about: list[object]) -> str:
+    options = [config.views, config.shading, config.encoder, config.loss, config.renderer]
+    digest = hashlib.sha256(_code())
+    known = [*options, config.optim.seed, torch.__version__, torch.get_num_threads()]
+    known += [torch.backends.cpu.get_cpu_capability(), encoder.precision]
+    for item in [*known, *about, *encoder.state_dict().values()]:
+        if isinstance(item, torch.Tensor):
+            flat = item.detach().cpu().contiguous().flatten()
+            digest.update(f"{item.device} {item.dtype} {tuple(item.shape)}".encode())
+            digest.update(flat.view(torch.uint8).numpy().data)
+        else:
+            digest.update(f"{item!r};".encode())
+    return digest.hexdigest()[:32]
+
+
+@cache
+def _code() -> bytes:
+    """Of every module of the package: which of them matter would have to be kept up to date."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.digest()
+
+
+def _read(path: Path, encoder: Encoder) -> tuple[Grams, Grams] | None:
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    try:
+        tensors = load_file(path, device=str(encoder.mean.device))
+        os.utime(path)
+    except (OSError, SafetensorError):
+        return None
+    names = sorted(tensors)
+    whole, local = ([tensors[n] for n in names if n.startswith(k)] for k in ("global", "local"))
+    return whole, local
+
+
+def _write(path: Path, found: tuple[Grams, Grams]) -> None:
+    from safetensors.torch import save_file
+
+    tensors: dict[str, Tensor] = {}
+    for kind, each in zip(("global", "local"), found, strict=True):
+        tensors |= {f"{kind}.{i:02d}": gram.contiguous().cpu() for i, gram in enumerate(each)}
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_file(tensors, partial)
+        os.replace(partial, path)
+        files = sorted(path.parent.glob("*.safetensors"), key=lambda p: p.stat().st_mtime)
+        for old in files[:-KEPT]:
+            old.unlink(missing_ok=True)
+    except OSError:  # a run needs no cache
+        partial.unlink(missing_ok=True)
