@@ -7,6 +7,7 @@
 #               meshes, files, overrides and renders, STRESS_FUZZ times as many as in CI
 # make sbom   what .venv holds, as CycloneDX, in build/sbom.json (tools in .venv-security)
 # make audit  known weaknesses of what .venv holds (asks pypi.org)
+# make bench-guard   is this tree slower than a commit (BASE=...), at the same moment on this machine?
 # make ray-test   a sweep on a local Ray cluster, in an environment of its own (.venv-ray)
 # Override: PYTHON (which interpreter), CONSTRAINTS (pinned versions; empty for none), PIP_FLAGS.
 
@@ -26,7 +27,7 @@ export OMP_WAIT_POLICY ?= PASSIVE
 # Named meshes and images, where there are some beside the checkout.
 export STYLEEXP_ASSETS ?= $(wildcard $(abspath ../shared))
 
-.PHONY: demo test lint docs conformance stress sbom audit ray-test clean
+.PHONY: demo test lint docs conformance stress sbom audit bench-guard ray-test clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -68,6 +69,9 @@ $(VENV)-security/.installed: Makefile
 	$(VENV)-security/bin/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) \
 		'cyclonedx-bom==7.5.0' 'pip-audit==2.10.1'
 	@touch $@
+
+bench-guard: $(VENV)/.installed-dev
+	$(BIN)/python benchmarks/guard.py $(BASE)
 
 # The Ray launcher pins cloudpickle below the tested version.
 ray-test: pyproject.toml constraints.txt

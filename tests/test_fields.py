@@ -58,7 +58,9 @@ def test_bf16_layers_are_those_of_torch(rows):
     field.zero_grad()
     x = encoded.bfloat16()
     for layer in field.hidden:
-        x = torch.relu(torch.nn.functional.linear(x, layer.weight.bfloat16(), layer.bias.bfloat16()))
+        x = torch.relu(
+            torch.nn.functional.linear(x, layer.weight.bfloat16(), layer.bias.bfloat16())
+        )
     expected = field.bound * torch.tanh(field.last(x.float()).squeeze(-1))
     torch.testing.assert_close(field(encoded, torch.bfloat16), expected)
     expected.sum().backward()

@@ -1,9 +1,9 @@
 """Target Gram matrices of earlier runs, so that a run like one before starts its steps sooner.
 
-Measuring the style, and the source as it is, takes as long as a dozen steps, and most runs of a study
-share it. A file is found by a digest of all that went into it: meshes, options, weights, the code
-itself, torch, threads. What it holds are the bits that would be computed; where there is none, or it
-can't be read, they are.
+Measuring the style, and the source as it is, takes as long as a dozen steps, and most runs of a
+study share it. A file is found by a digest of all that went into it: meshes, options, weights, the
+code itself, torch, threads. What it holds are the bits that would be computed; where there is none,
+or it can't be read, they are.
 """
 
 from __future__ import annotations

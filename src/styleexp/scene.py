@@ -142,9 +142,10 @@ def prepare(config: Config) -> Scene:
     else:
         picture = styles.tone(torch.from_numpy(style).to(device), grey, config.style)
         if config.loss.target != "bank":
-            target = styles.FixedTarget(*styles.mean_grams(loss, styles.whole_image_bank(picture, config)))
+            bank = styles.whole_image_bank(picture, config)
         else:
-            target = styles.FixedTarget(*styles.mean_grams(loss, styles.image_bank(picture, config, unit)))
+            bank = styles.image_bank(picture, config, unit)
+        target = styles.FixedTarget(*styles.mean_grams(loss, bank))
     goal, own = target(0), measured(surface, 1.0)(0)
     for what, grams in (("source", own), ("style", goal)):
         if not any(bool(gram.any()) for part in grams for gram in part):

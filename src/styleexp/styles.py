@@ -57,9 +57,7 @@ class SameViewsTarget:
         return self.loss.grams(whole), self.loss.grams(local)
 
 
-def mean_grams(
-    loss: StyleLoss, batches: Iterator[tuple[Images, Images]]
-) -> tuple[Grams, Grams]:
+def mean_grams(loss: StyleLoss, batches: Iterator[tuple[Images, Images]]) -> tuple[Grams, Grams]:
     """Grams of global and of local views, averaged over batches."""
     with torch.no_grad():
         pairs = [(loss.grams(whole), loss.grams(local)) for whole, local in batches]

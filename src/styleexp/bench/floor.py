@@ -23,6 +23,8 @@ Shape = tuple[int, int, int, int, int]
 """Images, channels in, channels out, height, width of a 3x3 convolution that keeps the size."""
 Call = tuple[tuple[int, ...], tuple[str, ...], bool]
 """Of an encoder: shape of the images, layers, whether gradients are taken."""
+Key = tuple[Shape, bool] | None
+"""A convolution and whether its gradient is meant, or (None) the matrix product."""
 PRODUCT = 2048
 """Rows and columns of the matrix product that is tried."""
 
@@ -53,22 +55,22 @@ def encoder_floor(encoder: Encoder, calls: Iterable[Call], repeats: int = 3) -> 
             forward[shape] += 1
             backward[shape] += gradients
     weight = next(encoder.convs.parameters())
-    work: dict[object, Callable[[], object]] = {}
+    work: dict[Key, Callable[[], object]] = {}
     for shape in forward:
         ahead, back = _convolution(shape, weight)
         work[shape, False] = ahead
         if backward[shape]:
             work[shape, True] = back
     square = torch.randn(PRODUCT, PRODUCT, device=weight.device).to(weight.dtype)
-    work["product"] = lambda: square @ square
+    work[None] = lambda: square @ square
     # The least time, not the median: what is looked for is what the machine can do.
     best = {key: min(times.cpu) for key, times in interleaved(work, repeats).items()}
-    counts = {(s, False): n for s, n in forward.items()} | {(s, True): n for s, n in backward.items()}
-    counts = {key: n for key, n in counts.items() if n}
+    counts: dict[tuple[Shape, bool], int] = {(shape, False): n for shape, n in forward.items()}
+    counts |= {(shape, True): n for shape, n in backward.items() if n}
     return Floor(
         sum(n * operations(shape) for (shape, _), n in counts.items()),
         {
-            "product": 2 * PRODUCT**3 / best["product"],
+            "product": 2 * PRODUCT**3 / best[None],
             "convolution": max(operations(key[0]) / best[key] for key in counts),
         },
         sum(n * best[key] for key, n in counts.items()),
@@ -81,7 +83,7 @@ def convolutions(encoder: Encoder, images: tuple[int, ...], layers: Iterable[str
     names = encoder.layer_names[: encoder.layer_names.index(deepest) + 1]
     found = []
     for name in names:
-        out, into = encoder.convs[name].weight.shape[:2]
+        out, into = encoder.convs[name].get_parameter("weight").shape[:2]
         stride = encoder.stride(name)
         found.append((images[0], into, out, images[2] // stride, images[3] // stride))
     return found
@@ -95,10 +97,13 @@ def operations(shape: Shape) -> float:
 
 def _convolution(shape: Shape, like: torch.Tensor) -> tuple[Callable[[], object], ...]:
     images, into, out, height, width = shape
-    last = {"memory_format": torch.channels_last}
-    x = torch.randn(images, into, height, width, device=like.device).to(like.dtype, **last)
-    grad = torch.randn(images, out, height, width, device=like.device).to(like.dtype, **last)
-    weight = torch.randn(out, into, 3, 3, device=like.device).to(like.dtype, **last)
+
+    def random(*sizes: int) -> torch.Tensor:
+        values = torch.randn(*sizes, device=like.device).to(like.dtype)
+        return values.to(memory_format=torch.channels_last)
+
+    x, grad = random(images, into, height, width), random(images, out, height, width)
+    weight = random(out, into, 3, 3)
     one = [1, 1]
 
     def ahead() -> object:

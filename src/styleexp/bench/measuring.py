@@ -1,7 +1,7 @@
 """Clocks, peak memory, and the machine that was measured on.
 
-Two times are taken of everything. Wall time is what a user feels; on a machine that others use, too,
-it measures them as well. CPU time is the process's own: with one thread it hardly changes when the
+Two times are taken of everything. Wall time is what a user feels; on a machine that others use, it
+measures them as well. CPU time is the process's own: with one thread it changes less when the
 machine is busy. Numbers of one process, taken in turns, make a ratio that holds on either.
 """
 
@@ -15,8 +15,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, TypeVar
 
+K = TypeVar("K")
 STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
@@ -38,11 +39,11 @@ class Times:
         return 1e3 * median(self.cpu)
 
 
-def interleaved(contenders: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, Times]:
+def interleaved(contenders: Mapping[K, Callable[[], object]], repeats: int) -> dict[K, Times]:
     """Run the contenders in turns, ``repeats`` times each, after once for nothing."""
     for run in contenders.values():
         run()
-    times: dict[str, Times] = {name: Times([], []) for name in contenders}
+    times: dict[K, Times] = {name: Times([], []) for name in contenders}
     for _ in range(repeats):
         for name, run in contenders.items():
             wall, cpu = time.perf_counter(), time.process_time()

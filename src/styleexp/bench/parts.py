@@ -1,9 +1,8 @@
 """Where the time of a step goes, by part, forward and backward, in the real loop.
 
-A part is a function whose calls are timed. What it takes and gives passes through a mark, which does
-nothing but to tell the clock when a gradient comes by: from a part's outputs on, the backward pass
-is in that part, until it leaves by its inputs. Every moment counts for one part, so they sum to the
-whole.
+A part is a function whose calls are timed. What it takes and gives passes through a mark, which
+tells the clock when a gradient comes by: from a part's outputs on, the backward pass is in that
+part, until it leaves by its inputs. Every moment counts for one part, so they sum to the whole.
 """
 
 from __future__ import annotations

@@ -187,7 +187,7 @@ def count_candidates(task: Task) -> int:
         spans(*given)
 
     try:
-        raster._test_boxes, raster._test_spans = count_boxes, count_spans
+        raster._test_boxes, raster._test_spans = count_boxes, count_spans  # type: ignore[assignment]
         ours(task, "soft_raster", torch.device("cpu"))()
     finally:
         raster._test_boxes, raster._test_spans = boxes, spans

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
@@ -49,8 +49,11 @@ class _Timed:
         return getattr(self._inner, name)
 
 
-def measure(overrides: Sequence[str], steps: int) -> dict[str, Any]:
-    """Take ``steps`` steps after two for nothing, with the overrides of ``styleexp``."""
+def measure(
+    overrides: Sequence[str], steps: int, watch: Callable[[Any], object] = lambda step: None
+) -> dict[str, Any]:
+    """Take ``steps`` steps after two for nothing, with the overrides of ``styleexp``; ``watch`` is
+    shown each."""
     config = compose(overrides)
     if config.threads:
         torch.set_num_threads(config.threads)
@@ -58,7 +61,9 @@ def measure(overrides: Sequence[str], steps: int) -> dict[str, Any]:
     scene = method.prepare(config)
     state = method.start(scene)
     if state is None or not isinstance(scene, Scene):
-        raise UserError("this method has no steps of the style loss: choose method=robust or paper.")
+        raise UserError(
+            "this method has no steps of the style loss: choose method=robust or paper."
+        )
     config.optim.steps = max(config.optim.steps, steps + 2)
     device = scene.surface.vertices.device
 
@@ -88,8 +93,10 @@ def measure(overrides: Sequence[str], steps: int) -> dict[str, Any]:
             for _ in range(count):
                 calls.clear()
                 clock.begin()
-                log(next(loop))
+                taken = next(loop)
+                log(taken)
                 rows.append(clock.end())
+                watch(taken)
 
         take(2)
         peak = peak_memory_mb(lambda: take(steps))

@@ -37,9 +37,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="styleexp-bench",
-        description="How fast it is, and where the time goes. Wall times are medians; CPU times are "
-        "the process's own and, with one thread, hold on a busy machine, too. docs/benchmarks.md "
-        "has what came out.",
+        description="How fast it is, and where the time goes. Times are medians. CPU times are the "
+        "process's own: with one thread they hold on a busy machine, too. docs/benchmarks.md has "
+        "what came out.",
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
@@ -185,9 +185,9 @@ def _show_step(found: dict[str, Any]) -> None:
         print(f"{name:22s} {wall:9.1f} {cpu:9.1f} {cpu / found['step_cpu_ms']:7.1%}")
     print(f"{'step':22s} {found['step_ms']:9.1f} {found['step_cpu_ms']:9.1f}")
     print(
-        f"encoder {found['encoder_share_cpu']:.1%} of a step, field {found['field_share_cpu']:.1%}; "
-        f"{found['dtype']}, {found['threads']} threads, {found['device']}, "
-        f"{found['peak_memory_mb']:.0f} MB"
+        f"encoder {found['encoder_share_cpu']:.1%} of a step, "
+        f"field {found['field_share_cpu']:.1%}; {found['dtype']}, "
+        f"{found['threads']} threads, {found['device']}, {found['peak_memory_mb']:.0f} MB"
     )
     if "encoder_over_floor" in found:
         rates = found["gflop_per_cpu_second"]

@@ -130,6 +130,7 @@ def _job(config: DictConfig) -> float | None:
 def _list_groups_once() -> None:
     """Let Hydra copy all configs once, not once for each of the 140 lists in the help: 1.5 s."""
     from functools import cache
+
     from hydra._internal.config_loader_impl import ConfigLoaderImpl
     from hydra._internal.config_repository import IConfigRepository
     from hydra.core.object_type import ObjectType

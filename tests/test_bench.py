@@ -1,0 +1,186 @@
+"""styleexp-bench at smoke sizes: structure and sanity, never a time's bound."""
+
+import json
+
+import pytest
+import torch
+from conftest import available
+
+from styleexp import meshes, shapes
+from styleexp.bench import convergence, render, step
+from styleexp.bench.floor import convolutions, operations
+from styleexp.bench.measuring import interleaved, peak_memory_mb
+from styleexp.bench.parts import Parts
+from styleexp.cli.bench import main
+from styleexp.encoders import load_encoder
+from styleexp.errors import UserError
+
+SMOKE = ["encoder=vgg19_random", "profile=smoke", "threads=1"]
+
+
+SHAPES = ["source=sphere", "style=bubble"]
+
+
+@pytest.fixture(autouse=True)
+def one_thread(monkeypatch, tmp_path):
+    monkeypatch.setenv("STYLEEXP_CACHE", str(tmp_path / "cache"))
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def smoke(tmp_path_factory):
+    """Overrides of a run that takes moments."""
+    folder = tmp_path_factory.mktemp("meshes")
+    for name in ("sphere", "bubble"):
+        mesh = shapes.make(name, 1000)
+        meshes.save_mesh(mesh, mesh.vertices, folder / f"{name}.obj")
+    return [*SMOKE, f"source.path={folder}/sphere.obj", f"style.path={folder}/bubble.obj"]
+
+
+def test_contenders_take_turns():
+    ran = []
+    times = interleaved({"a": lambda: ran.append("a"), "b": lambda: ran.append("b")}, 3)
+    assert ran == ["a", "b"] * 4
+    assert len(times["a"].wall) == len(times["b"].cpu) == 3
+
+
+def test_peak_memory_is_that_of_the_work():
+    nothing = peak_memory_mb(lambda: None)
+    much = peak_memory_mb(lambda: torch.ones(64 << 20, dtype=torch.uint8))
+    assert 50 < much - nothing < 100
+
+
+def test_every_moment_counts_for_one_part_forward_and_backward():
+    clock = Parts(torch.device("cpu"))
+    double = clock.timed("double", lambda x: 2 * x)
+    inner = clock.timed("inner", lambda x: x.exp())
+    outer = clock.timed("outer", lambda x: {"out": inner(x).sin()})
+    x = torch.ones(1000, requires_grad=True)
+    clock.begin()
+    outer(double(x))["out"].sum().backward()
+    spent = clock.end()
+    assert set(spent) == {
+        *("other", "double", "inner", "outer"),
+        *("double backward", "inner backward", "outer backward"),
+    }
+    assert all(wall >= 0 for wall, _ in spent.values())
+    torch.testing.assert_close(x.grad, 2 * torch.exp(2 * x.detach()) * torch.exp(2 * x).cos())
+
+
+def test_a_render_beside_another_renderer_of_ours(capsys):
+    pytest.importorskip("moderngl", reason="the extra gl is not installed")
+    given = ["--faces", "2000", "--views", "2", "--resolution", "64", "--repeats", "1"]
+    code = main(["render", *given, "--peer", "moderngl_deferred", "--json"])
+    told = capsys.readouterr()
+    available(lambda: code == 0 or raised(told.err))
+    row = json.loads(told.out)
+    assert row["ratio"] == pytest.approx(row["peer_ms"] / row["ours_ms"])
+    assert row["image_difference"] < 0.01
+    assert row["gradient_cosine"] > 0.95
+    assert row["candidates"] > row["coverage"] * 2 * 64 * 64
+    assert row["machine"]["threads"] == 1
+    assert {"visibility", "shading backward", "outlines backward"} <= set(row["parts_cpu_ms"])
+
+
+def raised(message):
+    raise UserError(message)
+
+
+def test_deodr_draws_the_same_picture():
+    pytest.importorskip("deodr", reason="the extra bench is not installed")
+    task = render.make_task("bubble", 2000, 2, 64)
+    row = render.measure(task, ["soft_raster", "deodr"], torch.device("cpu"), 1)
+    assert row["image_difference"] < 0.04
+    assert row["gradient_cosine"] > 0.5
+
+
+def test_several_sizes_are_rows(capsys):
+    given = ["--faces", "500,2000", "--views", "1", "--resolution", "32", "--repeats", "1"]
+    assert main(["render", *given, "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert [row["faces"] for row in rows] == sorted({row["faces"] for row in rows})
+    assert len(rows) == 2
+
+
+def test_the_instruments_leave_the_renderer_as_it_was():
+    from styleexp.renderers.soft_raster import deferred, raster
+
+    before = deferred.FaceNormals, deferred.find_crossings, raster._test_boxes
+    task = render.make_task("bubble", 500, 1, 32)
+    render.measure(task, ["soft_raster"], torch.device("cpu"), 1)
+    assert (deferred.FaceNormals, deferred.find_crossings, raster._test_boxes) == before
+
+
+def test_a_steps_parts_sum_to_the_step(smoke):
+    found = step.measure(smoke, 3)
+    for key in ("", "cpu_"):
+        parts, whole = found[f"parts_{key}ms"], found[f"step_{key}ms"]
+        assert sum(parts.values()) / whole == pytest.approx(1, abs=0.25)
+        assert 0 < found["encoder_share"] < 1
+    expected = {"field", "normals", "render", "image views", "encoder", "loss", "optimiser"}
+    expected |= {"field backward", "render backward", "encoder backward", "loss backward"}
+    assert expected <= set(found["parts_ms"])
+    assert found["encoder_over_floor"] >= found["encoder_over_convolutions"] > 0.5
+    assert found["threads"] == 1
+    assert found["steps"] == 3
+
+
+def test_the_parts_do_not_change_the_result(smoke):
+    from styleexp import baselines
+    from styleexp.compose import compose
+
+    config = compose([*smoke, "optim.steps=3"])
+    method = baselines.method(config)
+    scene = method.prepare(config)
+    losses = [each.loss for each in method.optimise(scene, method.start(scene))]
+    seen = []
+    step.measure([*smoke, "optim.steps=3"], 1, seen.append)
+    # Gradients are added up in another order, no more.
+    assert [each.loss for each in seen] == pytest.approx(losses, rel=1e-3)
+    assert seen[0].loss == losses[0]
+
+
+def test_the_encoders_operations_by_hand():
+    encoder = load_encoder("vgg19_random")
+    shapes = convolutions(encoder, (2, 3, 40, 24), ("conv2_1", "conv1_1"))
+    assert shapes == [(2, 3, 64, 40, 24), (2, 64, 64, 40, 24), (2, 64, 128, 20, 12)]
+    assert operations(shapes[0]) == 2 * 2 * 3 * 64 * 9 * 40 * 24
+
+
+def test_convergence_measures_both_methods_and_can_be_redrawn(tmp_path, capsys, smoke):
+    given = ["metrics.judge=vgg19_random", "metrics.windows=2"]
+    out = tmp_path / "curve.png"
+    arguments = ["--points", "2", "--out", str(out), "--json"]
+    assert main(["convergence", *smoke, *given, *arguments]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert out.stat().st_size > 1000
+    for points in found["methods"].values():
+        assert [point["step"] for point in points] == [0, 1, 4]
+        times = [point["seconds"] for point in points]
+        assert times == sorted(times)
+        assert points[0]["style_distance"] == pytest.approx(1, abs=0.5)
+    again = convergence.redraw(out.with_suffix(".json"), tmp_path / "again.png")
+    assert again["methods"] == found["methods"]
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (["render", "--peer", "soft_raster"], "name each renderer once"),
+        (["render", "--peer", "nothing"], "unknown renderer 'nothing'"),
+        (["render", "--mesh", "nothing"], "unknown shape 'nothing'"),
+        (["render", "--device", "cuda:77"], "can't be used"),
+        (["step", "optim.stepz=3"], "did you mean optim.steps"),
+        (["step", *SMOKE, "method=displacement_map", *SHAPES], "no steps of the style loss"),
+        (["convergence", *SMOKE, "method=paper"], "--methods"),
+        (["convergence", "--redraw", "nowhere.json"], "can't be drawn"),
+    ],
+)
+def test_mistakes_are_told_in_one_sentence(given, told, capsys):
+    assert main(given) == 2
+    error = capsys.readouterr().err
+    assert told in error
+    assert "Traceback" not in error
