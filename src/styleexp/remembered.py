@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -103,4 +104,5 @@ def _write(path: Path, found: tuple[Grams, Grams]) -> None:
         for old in files[:-KEPT]:
             old.unlink(missing_ok=True)
     except OSError:  # a run needs no cache
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):
+            partial.unlink()

@@ -1,1 +1,1 @@
-"""How fast it is, and where the time goes: ``styleexp-bench``. What came out: docs/benchmarks.md."""
+"""How fast it is, and where the time goes: ``styleexp-bench``. Results: docs/benchmarks.md."""
