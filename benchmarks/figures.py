@@ -11,6 +11,8 @@ import matplotlib
 matplotlib.use("Agg")
 from matplotlib import pyplot
 
+PARTS = ("visibility", "shading", "outlines", "normals", "projection", "other")
+
 rows = []
 for name in sys.argv[1:-1]:
     with open(name) as file:
@@ -25,19 +27,13 @@ figure, axes = pyplot.subplots(
 usual = {"faces": 20480, "resolution": 250, "views": 5}
 for axis, key in zip(axes[0], varied, strict=True):
     others = [k for k in axes_of if k != key]
-    line = sorted(
-        (row for row in rows if all(row[k] == usual[k] for k in others)), key=lambda r: r[key]
-    )
+    at_usual = [row for row in rows if all(row[k] == usual[k] for k in others)]
+    line = sorted({row[key]: row for row in at_usual}.values(), key=lambda row: row[key])
     xs = [row[key] for row in line]
     axis.plot(xs, [row["ours_cpu_ms"] for row in line], "ko-", label="whole")
-    parts: dict[str, None] = {}
-    for row in line:
-        parts |= dict.fromkeys(name.removesuffix(" backward") for name in row["parts_cpu_ms"])
-    for part in parts:
-        both = [
-            row["parts_cpu_ms"].get(part, 0) + row["parts_cpu_ms"].get(f"{part} backward", 0)
-            for row in line
-        ]
+    for part in PARTS:
+        spent = [row["parts_cpu_ms"] for row in line]
+        both = [each.get(part, 0) + each.get(f"{part} backward", 0) for each in spent]
         axis.plot(xs, both, ".-", label=part)
     axis.set(xscale="log", yscale="log", xlabel=key, ylabel="CPU ms, one thread")
     axis.grid(alpha=0.3)

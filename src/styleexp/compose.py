@@ -27,7 +27,7 @@ def register() -> None:
     targets.guard()
     store = ConfigStore.instance()
     store.store(name="base_config", node=schema.Config)
-    for name in schema.CHOICES["preview.name"]:
+    for name in map(str, schema.CHOICES["preview.name"]):
         store.store(group="preview", name=name, node={"name": name})
     meshes, pictures = asset_names("mesh"), asset_names("image")
     for name in {*SOURCES, *STYLES, *meshes}:

@@ -1,8 +1,8 @@
 """How near to the style a method is after how many seconds.
 
 Training losses of two methods can't be compared, so the mesh that each would end with is measured
-by the metric that judges finished runs. The clock stands still meanwhile. Seconds are those of a run's
-steps with everything before them, meshes and encoder loaded, targets measured.
+by the metric that judges finished runs. The clock stands still meanwhile. Seconds are those of a
+run's steps with everything before them: meshes and encoder loaded, targets measured.
 """
 
 from __future__ import annotations
