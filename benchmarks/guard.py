@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -135,6 +136,7 @@ def main() -> int:
     if not work or options.rounds < 1:
         print(f"guard: --only is part of one of {', '.join(WORK)}; --rounds 1 or more")
         return 2
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # the worktree goes in any case
     with tempfile.TemporaryDirectory() as folder:
         base = Path(folder) / "base"
         added = _git("worktree", "add", "--detach", "--quiet", str(base), options.base)
