@@ -30,10 +30,10 @@ API = {
     "Parts and plugins": ("registry", "plugins", "loggers", "errors"),
     "Runs, metrics, reports": ("records", "metrics", "metrics.style", "metrics.shape",
                                "metrics.truth", "reports", "reports.collect",
-                               "reports.reliability", "reports.study_results", "sweeps.plan", "sweeps.runner", "agreement"),
+                               "reports.reliability", "reports.study_results", "sweeps.plan", "sweeps.runner", "agreement", "remembered", "bench.render", "bench.step"),
 }  # fmt: skip
-COMMANDS = ("styleexp-assets", "styleexp-bake", "styleexp-metrics", "styleexp-plugins",
-            "styleexp-report", "styleexp-report study", "styleexp-sweep")  # fmt: skip
+COMMANDS = ("styleexp-assets", "styleexp-bake", "styleexp-bench", "styleexp-metrics",
+            "styleexp-plugins", "styleexp-report", "styleexp-report study", "styleexp-sweep")  # fmt: skip
 EXTERNAL = re.compile(
     r"""<(?:script|img|iframe|source|video|audio)\b[^>]*\bsrc=["']?(?:https?:)?//[^"'\s>]*"""
     r"""|<link\b(?=[^>]*\brel=["']?(?:stylesheet|preload|preconnect|icon|prefetch|modulepreload))"""
