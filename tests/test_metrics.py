@@ -10,6 +10,7 @@ from styleexp import meshes, metrics, shapes
 from styleexp.cli.metrics import main
 from styleexp.compose import compose
 from styleexp.metrics import patches, shape, style, truth
+from styleexp.metrics.board import nearest
 from styleexp.scene import pattern_unit
 
 DETAIL = 6_000
@@ -247,7 +248,7 @@ def test_the_verdict_tells_a_good_metric_from_a_bad_one(source):
         name: truth.Sample(style.Looks([], None, None), [], []) for name in ("right", "wrong")
     }
     board = truth.Board(styles=dict(sample), plain=sample["right"], own={"torus": sample["right"]})
-    for what in ("true", "faint", "half", "double", "noise", "shrunken"):
+    for what in ("true", "faint", "half", "double", "noise", "shrunken", *truth.IMPERFECT):
         board.cases["torus", "right", what] = sample["right"] if what == "true" else sample["wrong"]
 
     def good(result, goal, plain, own):
@@ -256,9 +257,23 @@ def test_the_verdict_tells_a_good_metric_from_a_bad_one(source):
     verdict = truth._verdict(good, board)
     assert verdict["kept"]
     assert verdict["rank1"] == verdict["scale"] == verdict["no_style"] == 1.0
+    assert verdict["imperfect"] == 0.0  # the three are the wrong style's
     verdict = truth._verdict(lambda *rest: 1.0 - good(*rest), board)
     assert not verdict["kept"]
     assert verdict["confusions"] == ["torus: right taken for wrong"]
+
+
+def test_of_a_board_the_nearest_style_of_the_same_kind_is_named():
+    mesh = style.Looks([], [], None)
+    picture = style.Looks([], None, None)
+    goals = {"bubble": mesh, "stripe": style.Looks([], [], None), "circles": picture}
+    far = {id(goals["bubble"]): 2.0, id(goals["stripe"]): 1.0, id(picture): 0.0}
+
+    def distance(looks, goal):
+        return far[id(goal)]
+
+    assert nearest(mesh, "bubble", goals, distance) == "stripe"
+    assert nearest(mesh, "circles", goals, distance) == "circles"
 
 
 @pytest.fixture(scope="module")
@@ -284,6 +299,7 @@ def test_a_board_is_measured_anew_and_says_which_runs_are_not_done(board, capsys
     found = json.loads(capsys.readouterr().out)
     assert found["of"] == found["styles"] == 2
     assert 0 <= found["identification"] <= 2
+    assert 0 <= found["identification_features"] <= 2
     assert found["min_silhouette_iou"] > 0.9
     assert "failed, not done" in next(r for r in found["runs"] if r["run"] == "failed")["status"]
     assert "style_distance" in json.loads(measured.read_text())

@@ -20,7 +20,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 TRUTH_SOURCES = ("sphere", "torus", "critter")
 """Sources of the truth board that need no files."""
-COLUMNS = ("rank1", "scale", "noise", "strength", "no_style")
+COLUMNS = ("rank1", "scale", "noise", "strength", "no_style", "imperfect")
 SHOWN = (
     "source",
     "style",

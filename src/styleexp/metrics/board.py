@@ -12,11 +12,18 @@ from styleexp import meshes, records
 from styleexp.errors import UserError
 from styleexp.metrics import Judge, measure
 from styleexp.metrics.patches import relief_of_result
-from styleexp.metrics.style import Looks, pattern_distance
+from styleexp.metrics.style import (
+    Looks,
+    appearance_distance,
+    pattern_distance,
+    relief_distance,
+)
 from styleexp.scene import pattern_unit
 from styleexp.sources import load_source, load_style
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from styleexp.config import Config
 
 
@@ -35,8 +42,9 @@ def measure_board(folder: Path, judge: Judge, write: bool = False) -> dict[str, 
     With ``write`` each run's ``metrics.json`` is replaced by what was measured now.
 
     ``identification`` counts the runs whose result looks nearest to their own style among all
-    styles of the board of its kind, meshes or pictures, which are compared differently; ``of`` is
-    how many runs were done. Those that weren't are listed as such.
+    styles of the board of its kind, meshes or pictures, which are compared differently
+    (`relief_or_appearance`; ``identification_features`` is the same by what `style_distance`
+    compares); ``of`` is how many runs were done. Those that weren't are listed as such.
     """
     rows: list[dict[str, Any]] = []
     results: list[tuple[dict[str, Any], Looks]] = []
@@ -63,16 +71,12 @@ def measure_board(folder: Path, judge: Judge, write: bool = False) -> dict[str, 
         relief = relief_of_result(source, vertices, faces, unit)
         results.append((row, judge.looks(config, relief, unit)))
     for row, looks in results:
-        own = goals[row["style"]]
-        far = {
-            name: pattern_distance(looks, goal)
-            for name, goal in goals.items()
-            if (goal.height is None) == (own.height is None)
-        }
-        row["looks_like"] = min(far, key=lambda name: far[name])
+        row["looks_like"] = nearest(looks, row["style"], goals, relief_or_appearance)
+        row["looks_like_features"] = nearest(looks, row["style"], goals, pattern_distance)
     done = [row for row, _ in results]
     return {
         "identification": sum(row["looks_like"] == row["style"] for row in done),
+        "identification_features": sum(row["looks_like_features"] == row["style"] for row in done),
         "of": len(done),
         "styles": len(goals),
         "min_silhouette_iou": min((row["silhouette_iou"] for row in done), default=None),
@@ -80,6 +84,22 @@ def measure_board(folder: Path, judge: Judge, write: bool = False) -> dict[str, 
         "max_spike": max((row["spike"] for row in done), default=None),
         "runs": rows,
     }
+
+
+def nearest(
+    looks: Looks, style: str, goals: dict[str, Looks], distance: Callable[[Looks, Looks], float]
+) -> str:
+    """The style of the same kind as ``style``, mesh or picture, that the result looks most like."""
+    is_picture = goals[style].height is None
+    rivals = [name for name, goal in goals.items() if (goal.height is None) == is_picture]
+    return min(rivals, key=lambda name: distance(looks, goals[name]))
+
+
+def relief_or_appearance(result: Looks, style: Looks) -> float:
+    """`relief_distance`, which recognises most of the imperfect results on the truth board; a
+    picture's relief isn't known, so its `appearance_distance`."""
+    apart = relief_distance(result, style)
+    return appearance_distance(result, style) if apart is None else apart
 
 
 def unit_of(config: Config, source: meshes.Mesh, style: meshes.Mesh | np.ndarray) -> float:
