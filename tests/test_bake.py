@@ -10,7 +10,9 @@ from PIL import Image
 
 from styleexp import bake, meshes
 from styleexp.cli.bake import main
+from styleexp.compose import recorded
 from styleexp.meshes import load_mesh, vertex_normals
+from styleexp.sources import describe
 
 SIZE = 256
 
@@ -49,6 +51,7 @@ def write_run(folder, source, displacement, moved):
         "schema": 1,
         "config": {"source": {"path": str(path)}, "style": {"name": "bubble"}},
     }
+    record["assets"] = describe(recorded(record["config"]))
     (folder / "run.json").write_text(json.dumps(record))
     (folder / "status.json").write_text('{"status": "done"}')
     meshes.save_mesh(source, moved, folder / "result.ply", displacement)

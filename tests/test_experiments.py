@@ -93,6 +93,8 @@ def test_experiment_runs(path, tmp_path):
                 if name in assets.names(kind) and assets.locate(name, kind) is None:
                     pytest.skip(f"the {kind} '{name}' is in no folder of STYLEEXP_ASSETS")
     arguments += ["profile=smoke", "encoder=vgg19_random", "hydra.sweep.dir=all"]
+    if path.stem == "layer_ablation":  # at 64 pixels no cell of conv4 is two cells from the rim
+        arguments.append("loss.erosion=0")
     done = styleexp(f"+experiment={path.stem}", *arguments, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     jobs = report.planned(tmp_path / "all")

@@ -1,4 +1,5 @@
-"""What a configuration may have Hydra call: nothing but Hydra's parts and this package's.
+"""What a configuration may have Hydra call: nothing but parts of Hydra and its search, and of this
+package.
 
 Hydra builds callbacks, launchers and sweepers from ``_target_``, and logging from ``()`` and
 ``class``, each of which may name any function that can be imported. Configuration files get passed
@@ -12,7 +13,7 @@ from typing import Any
 
 from styleexp.errors import UserError
 
-ALLOWED = ("hydra.", "hydra_plugins.", "styleexp.")
+ALLOWED = ("hydra.", "hydra_plugins.", "optuna.samplers.", "styleexp.")
 CALLED = ("_target_", "()")
 LOGGING = ("logging.StreamHandler", "logging.FileHandler", "logging.NullHandler", "colorlog.")
 
