@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from styleexp.cli.answers import answer
 from styleexp.errors import UserError
 
 # Read when torch loads; see cli.main.
@@ -21,17 +21,8 @@ FACES = "5000, 20000, 80000, 320000, 1280000"
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, or 2 after printing what the user can mend."""
-    options = _parser().parse_args(arguments)
-    try:
-        found = options.function(options)
-    except UserError as error:
-        print(f"styleexp-bench: {error}", file=sys.stderr)
-        return 2
-    if options.json:
-        print(json.dumps(found, indent=2))
-    else:
-        options.show(found)
-    return 0
+    parser = _parser()
+    return answer(parser, parser.parse_args(arguments))
 
 
 def _parser() -> argparse.ArgumentParser:

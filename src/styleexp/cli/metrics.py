@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from styleexp.cli.answers import answer
 from styleexp.errors import UserError
 
 if TYPE_CHECKING:
@@ -37,17 +37,8 @@ SHOWN = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, or 2 after printing what the user can mend."""
-    options = _parser().parse_args(arguments)
-    try:
-        found = options.function(options)
-    except UserError as error:
-        print(f"styleexp-metrics: {error}", file=sys.stderr)
-        return 2
-    if options.json:
-        print(json.dumps(found, indent=2))
-    else:
-        options.show(found)
-    return 0
+    parser = _parser()
+    return answer(parser, parser.parse_args(arguments))
 
 
 def _parser() -> argparse.ArgumentParser:
