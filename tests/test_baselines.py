@@ -13,7 +13,6 @@ import torch
 
 import styleexp
 from styleexp import baselines, meshes, shapes
-from styleexp.baselines.displacement_map import HeightMap, mesh_patch, triplanar
 from styleexp.baselines.face_gan import Critic, Generator, Patch, gradient_penalty
 from styleexp.baselines.geometric_textures import choose_patch, fit_exemplar
 from styleexp.baselines.pyramid import adjacency, pyramid, restrict, upsample
@@ -21,6 +20,7 @@ from styleexp.baselines.specs import DisplacementMapConfig
 from styleexp.compose import compose
 from styleexp.errors import UserError
 from styleexp.fields import VertexField
+from styleexp.height_maps import HeightMap, mesh_patch, triplanar
 
 SMOKE = ("profile=smoke", "encoder=vgg19_random")
 FOLDER = {"run.json", "status.json", "metrics.json", "preview.png", "turntable.gif", "result.ply",

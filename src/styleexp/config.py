@@ -74,6 +74,11 @@ class FieldConfig:
     """Displacements lie in (-bound, bound), in radii; see ``style.scale_by``. null: twice what the
     style mesh's own relief needs; of a picture, which doesn't tell its height, twice 0.15 of its
     wavelength. The paper has 0.1."""
+    start: str = "map"
+    """What the field's displacement is added to. ``map``: the style's height map, laid on by
+    triplanar projection (`styleexp.height_maps`). ``source``: nothing, as in the paper."""
+    learned: float = 0.25
+    """``start=map``: how much of the bound the learned part may use, 0 to 1."""
     zero_mean: bool = True
     """Subtract the area-weighted mean displacement, so that the mesh can't shrink as a whole."""
 
@@ -275,6 +280,7 @@ class Config:
 CHOICES: dict[str, tuple[Any, ...]] = {
     "style.scale_by": ("area", "frame"),
     "views.spread": ("normal", "around"),
+    "field.start": ("map", "source"),
     "views.local.mode": ("image", "zoom", "surface"),
     "views.local.crop": ("side", "area"),
     "shading.normals": ("flat", "smooth"),
@@ -314,6 +320,7 @@ BETWEEN = {
     "style.image_contrast": (0.0, 0.5),
     "field.sigma": (1e-3, 1e3),
     "field.bound": (1e-4, 1.0),
+    "field.learned": (0.0, 1.0),
     "field.depth": (2, 64),
     "field.progressive": (0.0, 1.0),
     "views.resolution": (32, 4096),

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from styleexp import meshes, remembered, styles
+from styleexp import height_maps, meshes, remembered, styles
 from styleexp.config import check
 from styleexp.errors import UserError
 from styleexp.geometry import Surface, vertex_areas
@@ -75,6 +75,8 @@ class Scene(Subject):
     viewer: Viewer
     loss: StyleLoss
     target: StyleTarget
+    base: Float[Tensor, " vertices"] | None
+    """What the field's displacement is added to (``field.start``); None is nothing."""
     scales: tuple[list[Tensor], list[Tensor]]
     """What the distances of the global and the local views are divided by, for each layer."""
 
@@ -111,6 +113,7 @@ def load(config: Config) -> Subject:
 def prepare(config: Config) -> Scene:
     """Load source, style, renderer and encoder, and measure the style."""
     subject = load(config)
+    base, told = start_of(subject)
     surface, style, unit = subject.surface, subject.style, subject.unit
     device = surface.vertices.device
     renderer = build("renderer", config.renderer)
@@ -154,12 +157,26 @@ def prepare(config: Config) -> Scene:
                 "lower views.distance, or raise views.resolution and views.local.size."
             )
     return Scene(
-        **vars(subject),
+        **{**vars(subject), "notes": (*subject.notes, *told)},
         viewer=viewer,
         loss=loss,
         target=target,
+        base=base,
         scales=(loss.scales(goal[0], own[0]), loss.scales(goal[1], own[1])),
     )
+
+
+def start_of(subject: Subject) -> tuple[Tensor | None, list[str]]:
+    """What the field is added to (``field.start``), and what to tell the user about it."""
+    if subject.config.field.start == "source":
+        return None, []
+    try:
+        return height_maps.displacement(subject), []
+    except height_maps.NoPatch:
+        name = subject.config.style.name
+        return None, [
+            f"the style '{name}' is too coarse for a height map: the field starts at the source."
+        ]
 
 
 def pattern_unit(config: StyleConfig, source: meshes.Mesh, style: meshes.Mesh | None) -> float:

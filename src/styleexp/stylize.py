@@ -127,8 +127,11 @@ def start(scene: Scene) -> State:
     """The state before the first step: M = C."""
     optim = scene.config.optim
     generator = step_generator(optim.seed, 0, stream=7)
+    config, bound = scene.config.field, scene.bound
+    if scene.base is not None:
+        bound *= config.learned
     displacement_field = plugins.build(
-        "field", scene.config.field, generator=generator, sigma=scene.sigma, bound=scene.bound
+        "field", config, generator=generator, sigma=scene.sigma, bound=bound
     )
     displacement_field.to(scene.surface.vertices.device)
     displacement_field.encode(scene.surface.vertices)  # lazy parameters get their shape here
@@ -238,8 +241,10 @@ def displace(
     if config.progressive > 0:
         opened = min(1.0, state.step / (config.progressive * scene.config.optim.steps))
     displacement = state.field(state.field.encode(scene.surface.vertices, opened), precision)
+    if scene.base is not None:
+        displacement = (scene.base + displacement).clamp(-scene.bound, scene.bound)
     if config.zero_mean:
-        displacement = zero_mean(displacement, scene.areas, state.field.bound)
+        displacement = zero_mean(displacement, scene.areas, scene.bound)
     return displacement
 
 

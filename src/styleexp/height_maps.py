@@ -1,0 +1,169 @@
+"""The style as a height map laid on the source by triplanar projection.
+
+The map is a picture's tone, or a patch of the style mesh's own relief. It is projected along the
+three axes, tiled by mirroring, and the three heights are blended by the components of the vertex
+normal. No view is rendered, nothing is learned: what a technical artist would do, in an instant. It
+is where the field starts (`field.start`), and a baseline.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch.nn import functional
+
+from styleexp import meshes, shapes, styles
+from styleexp.errors import UserError
+from styleexp.fields import zero_mean
+from styleexp.images import luminance
+from styleexp.relief import half_range, mesh_relief
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+    from torch import Tensor
+
+    from styleexp.scene import Subject
+
+AXES = ((2, 1), (0, 2), (0, 1))
+"""The map's right and up, as axes of the source, for the projections along x, y and z."""
+
+SAMPLED = 40_000
+"""At most so many of the style's vertices are looked at to find its patch."""
+
+PATCH_DETAIL = 256
+"""Pixels on a side of the height map of a style mesh."""
+
+PATCH = 0.6
+"""Radius of the patch that a style mesh's height map is taken from, in the style's radii."""
+
+SHARPNESS = 8.0
+"""Power of the normal's components by which the three projections are blended."""
+
+RELIEF_LENGTH = 0.5
+"""What is larger than this, in radii of the style, is its shape, not its relief."""
+
+
+class NoPatch(UserError):
+    """The style mesh has nowhere enough vertices side by side for a height map."""
+
+
+@dataclass(frozen=True)
+class HeightMap:
+    """One tile, row 0 at the top, its mean 0, its half range 1."""
+
+    height: Float[Tensor, "rows columns"]
+    side: float
+    """Length of the longer side on the result, in radii of the normalised source."""
+
+
+def displacement(
+    scene: Subject, height: float | None = None, patch: float = PATCH, sharpness: float = SHARPNESS
+) -> Float[Tensor, " vertices"]:
+    """The style's height map as a displacement of the source's vertices, zero on average over the
+    surface, in radii of the normalised source.
+
+    ``height`` is half its range; the style's own relief's where none is given.
+    """
+    tile, surface = height_map(scene, patch), scene.surface
+    raised = triplanar(tile, surface.vertices, surface.normals, sharpness)
+    height = scene.relief if height is None else height
+    return zero_mean(height * raised, scene.areas, math.inf)
+
+
+def height_map(scene: Subject, patch: float) -> HeightMap:
+    """The style as a height map of the size that ``style.scale`` and ``style.image_tile`` say."""
+    style, device = scene.style, scene.surface.vertices.device
+    if isinstance(style, meshes.Mesh):
+        height = torch.from_numpy(mesh_patch(style, patch)).to(device)
+        side = patch * math.sqrt(2) * scene.unit
+    else:
+        height = luminance(torch.from_numpy(style).to(device))
+        side = scene.unit * scene.config.style.image_tile * math.sqrt(4 * math.pi)
+    # Detail finer than the source's edges would come out as noise.
+    edge = meshes.mean_edge_length(scene.source.vertices, scene.source.faces) / scene.frame.scale
+    height = styles.resized(height, min(side / edge, max(height.shape)))
+    spread = max(half_range(height.cpu().numpy().ravel()), 1e-6)
+    return HeightMap((height - height.mean()) / spread, side)
+
+
+def mesh_patch(style: meshes.Mesh, radius: float) -> Float[np.ndarray, "side side"]:
+    """The relief of a style mesh over the square inside a disc of ``radius`` radii, seen from
+    straight above, y up.
+
+    The height is `shapes.relief` for an analytic style, `relief.mesh_relief` for any other. The
+    disc lies where the mesh is flattest and steepest, so that its patterns keep what is up.
+    """
+    from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+    from scipy.spatial import cKDTree
+
+    vertices = meshes.normalisation(style.vertices).apply(style.vertices)
+    normals = meshes.vertex_normals(vertices, style.faces)
+    if style.carrier is None and style.name in shapes.STYLES:
+        height = shapes.relief(style.name, style.vertices)
+    else:
+        height = mesh_relief(vertices, style.faces, normals, RELIEF_LENGTH)
+
+    # Candidates spread over the mesh; around each, how well the normals agree.
+    seeds = spread(len(vertices), 500)
+    some = np.union1d(seeds, spread(len(vertices), SAMPLED))
+    around = cKDTree(vertices[some]).query_ball_point(vertices[seeds], radius)
+    mean = np.stack([normals[some[near]].mean(axis=0) for near in around])
+    flat = np.linalg.norm(mean, axis=1)
+    mean /= np.maximum(flat, 1e-9)[:, None]
+    best = int(np.argmax(flat - 0.5 * mean[:, 1] ** 2))
+
+    out = mean[best]
+    up = np.array([0.0, 1.0, 0.0]) if abs(out[1]) < 0.99 else np.array([0.0, 0.0, -1.0])
+    up = up - (up @ out) * out
+    up /= np.linalg.norm(up)
+    right = np.cross(up, out)
+    # A little more than the square, for the interpolation at its border; the near side alone.
+    offset = vertices - vertices[seeds[best]]
+    plane = np.stack([offset @ right, offset @ up], axis=1)
+    half = radius / math.sqrt(2)
+    depth = offset @ out
+    seen = (np.abs(plane) < 1.1 * half).all(axis=1) & (normals @ out > 0.2) & (depth > -radius)
+    if seen.sum() < 16 or np.linalg.matrix_rank(plane[seen] - plane[seen][0], tol=1e-6) < 2:
+        raise NoPatch(
+            f"the style '{style.name}' has no patch of {radius} radii to take a height map from: "
+            "give a larger baseline.patch, or a style with more vertices."
+        )
+    across = (np.arange(PATCH_DETAIL) + 0.5) / PATCH_DETAIL * 2 - 1
+    x, y = np.meshgrid(half * across, -half * across)
+    found = LinearNDInterpolator(plane[seen], height[seen])(x, y)
+    nearest = NearestNDInterpolator(plane[seen], height[seen])(x, y)
+    return np.where(np.isnan(found), nearest, found).astype(np.float32)
+
+
+def spread(count: int, most: int) -> Int[np.ndarray, " some"]:
+    """At most ``most`` of the indices below ``count``, evenly spread."""
+    return np.linspace(0, count - 1, min(count, most)).astype(int)
+
+
+def triplanar(
+    tile: HeightMap,
+    points: Float[Tensor, "points 3"],
+    normals: Float[Tensor, "points 3"],
+    sharpness: float,
+) -> Float[Tensor, " points"]:
+    """Height at points of a surface: the tile projected along x, y and z, blended by the normal.
+
+    A tile has a corner at the origin, and its neighbours are its mirror images.
+    """
+    rows, columns = tile.height.shape
+    texel = tile.side / max(rows, columns)
+    weights = normals.abs() ** sharpness
+    weights = weights / weights.sum(dim=1, keepdim=True)
+    total = points.new_zeros(len(points))
+    for axis, (right, up) in enumerate(AXES):
+        u, v = points[:, right] / (columns * texel), -points[:, up] / (rows * texel)
+        grid = (2 * torch.stack([u, v], dim=1) - 1)[None, :, None]
+        seen = functional.grid_sample(
+            tile.height[None, None], grid, padding_mode="reflection", align_corners=False
+        )
+        total = total + weights[:, axis] * seen[0, 0, :, 0]
+    return total
