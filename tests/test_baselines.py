@@ -20,7 +20,6 @@ from styleexp.baselines.specs import DisplacementMapConfig
 from styleexp.compose import compose
 from styleexp.errors import UserError
 from styleexp.fields import VertexField
-from styleexp.height_maps import HeightMap, mesh_patch, triplanar
 
 SMOKE = ("profile=smoke", "encoder=vgg19_random")
 FOLDER = {"run.json", "status.json", "metrics.json", "preview.png", "turntable.gif", "result.ply",
@@ -155,39 +154,6 @@ def test_vertex_runs_with_the_same_loss_and_resumes_to_the_same_bits(tmp_path):
 
 
 # -------------------------------------------------------------------------------- displacement map
-
-
-def test_triplanar_is_the_tile_where_the_normal_is_an_axis():
-    """Height v on the planes x = 0 and z = 0, whose up is y: bands at the same heights."""
-    rows = torch.linspace(1, -1, 64)[:, None].expand(64, 64)
-    tile = HeightMap(rows, 2.0)
-    y = torch.linspace(-1.9, -0.1, 10)
-    points = torch.stack([torch.full_like(y, 0.3), y, torch.full_like(y, -0.4)], dim=1)
-    along_x, along_z = torch.eye(3)[[0]].expand(10, 3), -torch.eye(3)[[2]].expand(10, 3)
-    expected = torch.linspace(1, -1, 64)[((-y / 2) * 64).long().clamp(max=63)]
-    for normals in (along_x, along_z):
-        torch.testing.assert_close(triplanar(tile, points, normals, 8.0), expected,
-                                   atol=0.05, rtol=0)  # fmt: skip
-    mirrored = points * torch.tensor([1.0, -1.0, 1.0])
-    torch.testing.assert_close(
-        triplanar(tile, mirrored, along_x, 8.0), triplanar(tile, points, along_x, 8.0)
-    )
-
-
-def test_patch_of_the_stripe_is_its_bands_at_their_own_distance():
-    patch = mesh_patch(shapes.make("stripe"), 0.6)
-    assert patch.std(axis=1).max() < 0.3 * patch.std()  # bands run along the rows
-    profile = patch.mean(axis=1) - patch.mean()
-    spectrum = np.abs(np.fft.rfft(profile * np.hanning(len(profile))))
-    bands = 0.6 * math.sqrt(2) / (math.pi / 14)
-    assert spectrum[1:].argmax() + 1 == pytest.approx(bands, abs=0.8)
-
-
-def test_patch_of_a_mesh_file_shows_the_same_relief_as_the_analytic_style():
-    style = shapes.make("bubble", detail=20_000)
-    other = meshes.Mesh("of no known name", style.vertices, style.faces)
-    exact, measured = mesh_patch(style, 0.5), mesh_patch(other, 0.5)
-    assert np.corrcoef(exact.ravel(), measured.ravel())[0, 1] > 0.9
 
 
 def test_displacement_map_writes_the_same_folder_and_needs_no_encoder(tmp_path):

@@ -173,7 +173,8 @@ def start_of(subject: Subject) -> tuple[Tensor | None, list[str]]:
     try:
         return height_maps.displacement(subject), []
     except height_maps.NoPatch:
-        name = subject.config.style.name
+        assert isinstance(subject.style, meshes.Mesh)
+        name = subject.style.name
         return None, [
             f"the style '{name}' is too coarse for a height map: the field starts at the source."
         ]
