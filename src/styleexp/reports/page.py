@@ -98,6 +98,8 @@ def build(run: Run, shown: Shown) -> str:
 def facts(run: Run, shown: Shown) -> list[tuple[str, str]]:
     """The few numbers that a reader wants first."""
     found = [("status", run.state)]
+    if asked := [each for each in run.overrides if not each.lstrip("+~").startswith("hydra.")]:
+        found.append(("asked for", " ".join(asked)))
     baseline = run.config.get("baseline.name")
     if baseline:
         found.append(("method", f"{baseline} (a baseline)"))
