@@ -3,8 +3,11 @@ import math
 import pytest
 import torch
 
+from styleexp import meshes, shapes
 from styleexp.config import FieldConfig
 from styleexp.fields import DisplacementField, FourierFeatures, zero_mean
+from styleexp.geometry import Surface, unfolded
+from styleexp.metrics.shape import flipped_faces
 
 
 def generator(seed=0):
@@ -108,3 +111,25 @@ def test_zero_mean_is_weighted_by_area_and_keeps_the_bound():
     assert (centred * areas).sum() == pytest.approx(0.0, abs=1e-7)
     far = zero_mean(torch.tensor([0.1, -0.1, -0.1]), torch.ones(3), 0.1)
     assert far.abs().max() <= 0.1
+
+
+def test_what_turns_over_is_damped_and_nothing_else_is_touched():
+    mesh = shapes.make("torus", detail=600)
+    vertices, faces = torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces)
+    normals = torch.from_numpy(meshes.vertex_normals(mesh.vertices, mesh.faces))
+    surface = Surface(vertices, faces, normals)
+    rough = torch.zeros(len(vertices), dtype=torch.float64)
+    rough[::40] = 0.6  # far beyond the edges' length
+    smooth = unfolded(surface, rough)
+
+    def flipped(displacement):
+        return flipped_faces(
+            mesh.vertices, mesh.vertices + (displacement[:, None] * normals).numpy(), mesh.faces
+        )
+
+    assert flipped(-rough) > 0.01
+    assert flipped(unfolded(surface, -rough)) == 0 == flipped(smooth)
+    assert (unfolded(surface, -rough).abs() <= rough).all()
+    assert unfolded(surface, -rough).abs().sum() > 0
+    gentle = 1e-3 * rough
+    assert torch.equal(unfolded(surface, gentle), gentle)

@@ -147,7 +147,9 @@ def test_every_finished_run_leaves_its_page(finished):
     assert np.abs(stored * scene["nodes"][0]["scale"][0] - frame).max() < 1e-4
     status = json.loads((finished / "status.json").read_text())
     assert f"<dd>{status['seconds']:.0f} s</dd>" in text
-    assert re.search(r"<dt>asked for</dt><dd>[^<]*style=bubble [^<]*encoder=vgg19_random</dd>", text)
+    assert re.search(
+        r"<dt>asked for</dt><dd>[^<]*style=bubble [^<]*encoder=vgg19_random</dd>", text
+    )
     assert "Apache License" in text
 
 

@@ -81,6 +81,8 @@ class FieldConfig:
     """``start=map``: how much of the bound the learned part may use, 0 to 1."""
     zero_mean: bool = True
     """Subtract the area-weighted mean displacement, so that the mesh can't shrink as a whole."""
+    unfold: bool = True
+    """Damp the final displacement where faces would turn over, until none does."""
 
 
 @dataclass

@@ -30,6 +30,47 @@ def vertex_areas(surface: Surface) -> Float[Tensor, " vertices"]:
     return total.index_add(0, surface.faces.reshape(-1), areas.repeat_interleave(3))
 
 
+STEEPEST = 0.02
+"""Cosine between a face before and after; below it, the face counts as turned over."""
+
+DAMPING = 0.2
+"""How much of the displacement a round of `unfolded` takes off where faces turned over."""
+
+
+def unfolded(
+    surface: Surface, displacement: Float[Tensor, " vertices"]
+) -> Float[Tensor, " vertices"]:
+    """The displacement along the normals, damped where faces would turn over, until none does.
+
+    At creases and thin parts neighbouring normals cross within the displacement's reach. Vertices
+    of turned faces are damped in rounds, their neighbours in proportion to how many of theirs are.
+    """
+    faces, dtype = surface.faces, displacement.dtype
+    vertices, normals = surface.vertices.to(dtype), surface.normals.to(dtype)
+    tails, heads = faces.reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
+    both, other = torch.cat([tails, heads]), torch.cat([heads, tails])
+    zeros = displacement.new_zeros(len(vertices))
+    degree = zeros.index_add(0, both, torch.ones_like(both, dtype=dtype)).clamp(min=1)
+    before = _face_normals(vertices, faces)
+    for _ in range(100):  # then next to nothing is left there
+        after = _face_normals(vertices + displacement[:, None] * normals, faces)
+        turned = (before * after).sum(1) < STEEPEST * before.norm(dim=1) * after.norm(dim=1)
+        if not bool(turned.any()):
+            break
+        at = zeros.index_fill(0, faces[turned].reshape(-1), 1.0)
+        around = zeros.index_add(0, both, at[other]) / degree
+        displacement = displacement * (1 - DAMPING * torch.maximum(at, around))
+    return displacement
+
+
+def _face_normals(
+    vertices: Float[Tensor, "vertices 3"], faces: Int[Tensor, "faces 3"]
+) -> Float[Tensor, "faces 3"]:
+    """Twice the area long."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    return torch.linalg.cross(b - a, c - a)
+
+
 def sample_surface(
     surface: Surface, count: int, generator: torch.Generator
 ) -> tuple[Float[Tensor, "count 3"], Float[Tensor, "count 3"]]:

@@ -23,6 +23,7 @@ from styleexp import baselines, meshes, plugins
 from styleexp.compose import compose
 from styleexp.errors import UserError
 from styleexp.fields import zero_mean
+from styleexp.geometry import unfolded
 from styleexp.scene import Scene, Subject
 from styleexp.scene import prepare as prepare  # this module is a `baselines.Method`
 from styleexp.views import step_generator
@@ -252,6 +253,8 @@ def finish(scene: Scene, state: State) -> Result:
     """The generated mesh in the source's own frame; the field is evaluated in float32."""
     with torch.no_grad():
         displacement = displace(scene, state, torch.float32).double() * scene.config.strength
+        if scene.config.field.unfold:
+            displacement = unfolded(scene.surface, displacement)
     offset = displacement[:, None] * scene.surface.normals.double()
     radius = scene.frame.scale
     return Result(
