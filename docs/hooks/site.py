@@ -18,7 +18,7 @@ PACKAGE = ROOT / "src" / "styleexp"
 
 API = {
     "The method": (
-        "stylize", "scene", "fields", "views", "viewer", "losses", "styles", "relief", "config", "baselines", "baselines.geometric_textures",
+        "stylize", "scene", "fields", "height_maps", "geometry", "views", "viewer", "losses", "styles", "relief", "config", "baselines", "baselines.geometric_textures",
     ),
     "Meshes and pictures": ("meshes", "meshes.mesh", "meshes.reading", "meshes.writing",
                             "meshes.remeshing", "images", "shapes", "assets", "sources", "bake"),
