@@ -67,14 +67,15 @@ least(run, 5)
 """
 
 ENCODER = """
+from styleexp.config import LossConfig
 from styleexp.encoders import load_encoder
-from styleexp.losses import gram_matrix
-encoder = load_encoder("vgg19_random")
-layers = ["conv1_1", "conv2_1", "conv3_1", "conv4_1", "conv5_1"]
-images = torch.rand(2, 3, 250, 250, requires_grad=True)
+from styleexp.losses import StyleLoss
+from styleexp.viewer import Images
+loss = StyleLoss(LossConfig(), load_encoder("vgg19_random"))
+seen = Images(torch.rand(2, 250, 250, 3, requires_grad=True), torch.ones(2, 250, 250))
 
 def run():
-    sum(gram_matrix(f).square().sum() for f in encoder(images, layers).values()).backward()
+    sum(gram.square().sum() for gram in loss.grams(seen)).backward()
 
 least(run, 5)
 """

@@ -130,6 +130,7 @@ def test_a_steps_parts_sum_to_the_step(smoke):
         assert 0 < found["encoder_share"] < 1
     expected = {"field", "normals", "render", "image views", "encoder", "loss", "optimiser"}
     expected |= {"field backward", "render backward", "encoder backward", "loss backward"}
+    expected |= {"Gram matrices", "Gram matrices backward"}
     assert expected <= set(found["parts_ms"])
     assert found["encoder_over_floor"] >= found["encoder_over_convolutions"] > 0.5
     assert found["threads"] == 1

@@ -12,7 +12,7 @@ from torch.nn import functional
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from styleexp import assets
-from styleexp.encoders import ENCODERS, Encoder, load_encoder, vgg, weights
+from styleexp.encoders import ENCODERS, Encoder, fused, load_encoder, vgg, weights
 from styleexp.errors import UserError
 
 PAPER = [1, 3, 5, 9, 13]
@@ -163,42 +163,69 @@ def test_grey_is_three_equal_channels():
 @pytest.mark.parametrize("pooling", ["max", "avg"])
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
 @pytest.mark.parametrize("layers", [PAPER, ["conv1_2", "conv3_4", "conv3_1"]])
-def test_fused_is_one_operation_after_another(precision, pooling, layers):
+def test_gram_sums_are_those_of_the_activations(precision, pooling, layers, monkeypatch):
     encoder = build(precision=precision, pooling=pooling)
     names = encoder.resolve(layers)
-    run = encoder.layer_names[: encoder.layer_names.index(max(names)) + 1]
-    dtype = next(encoder.convs.parameters()).dtype
+    seen = images(3)
+    # Two images at once in the first block, all three in later ones.
+    first = encoder.convs["conv1_1"].weight
+    monkeypatch.setattr(fused, "PART", 2 * len(first) * seen[0, 0].numel() * first.element_size())
+    cells = {n: [side // encoder.stride(n) for side in seen.shape[2:]] for n in names}
+    draw = torch.Generator().manual_seed(1)
+    masks = {n: torch.rand(len(seen), *cells[n], generator=draw) < 0.6 for n in names}
+    masks[names[1]] = None
     results = []
-    for apart in (False, True):
-        given = images().requires_grad_()
-        x = ((given - encoder.mean) / encoder.std).to(dtype, memory_format=torch.channels_last)
-        served = encoder._plain(x, run) if apart else encoder(given, names)
-        weigh = torch.Generator().manual_seed(1)
-        total = sum(
-            (served[n] * torch.randn(served[n].shape, generator=weigh).to(dtype)).float().mean()
-            for n in names
-        )
-        total.backward()
-        results.append(([served[n] for n in names], given.grad))
+    for at_once in (True, False):
+        given = seen.clone().requires_grad_()
+        if at_once:
+            sums = encoder.gram_sums(given, masks)
+        else:
+            sums = {
+                n: a.float().permute(0, 2, 3, 1)[... if masks[n] is None else masks[n]]
+                for n, a in encoder(given, names).items()
+            }
+            sums = {n: f.flatten(0, -2).T @ f.flatten(0, -2) for n, f in sums.items()}
+        sum(s.square().sum() / s.detach().square().sum() for s in sums.values()).backward()
+        results.append((sums, given.grad))
     limit = 1e-5 if precision == "fp32" else 0.02
-    for fused, apart in zip(results[0][0], results[1][0], strict=True):
-        torch.testing.assert_close(fused, apart, rtol=limit, atol=limit)
-    fused, apart = (gradient.flatten().double() for _, gradient in results)
-    assert torch.cosine_similarity(fused, apart, dim=0) > 1 - 1e-3
-    assert fused.norm() / apart.norm() == pytest.approx(1, abs=0.01)
+    assert list(results[0][0]) == list(names)
+    for name in names:
+        ours, theirs = (sums[name] for sums, _ in results)
+        assert ours.dtype == torch.float32
+        assert (ours - theirs).norm() / theirs.norm() < limit
+    ours, theirs = (gradient.flatten().double() for _, gradient in results)
+    assert torch.cosine_similarity(ours, theirs, dim=0) > 1 - 1e-3
+    assert ours.norm() / theirs.norm() == pytest.approx(1, abs=0.01)
 
 
-def test_activations_are_freed_with_the_backward_pass_or_the_features():
+def test_gram_sums_follow_weights_that_change():
     encoder = build()
+    assert encoder.is_fused
+
+    def gradient():
+        given = images().requires_grad_()
+        encoder.gram_sums(given, {"conv1_2": None})["conv1_2"].sum().backward()
+        return given.grad
+
+    first = gradient()
+    with torch.no_grad():
+        for values in encoder.convs["conv1_2"].parameters():
+            values.mul_(2)
+    torch.testing.assert_close(gradient(), 4 * first)  # twice the activations
+    assert not encoder.double().is_fused
+
+
+def test_activations_are_freed_with_the_backward_pass_or_the_sums():
+    encoder, masks = build(), dict.fromkeys(tiny().resolve(PAPER))
     given = images().requires_grad_()
-    served = encoder(given, PAPER)
-    kept = weakref.ref(served["conv5_1"].grad_fn)
-    served["conv5_1"].sum().backward(retain_graph=True)
+    sums = encoder.gram_sums(given, masks)
+    kept = weakref.ref(sums["conv5_1"].grad_fn)
+    sums["conv5_1"].sum().backward(retain_graph=True)
     with pytest.raises(RuntimeError, match="no second backward"):
-        served["conv5_1"].sum().backward()
-    served = encoder(given, PAPER)
-    unused = weakref.ref(served["conv5_1"].grad_fn)
-    del served
+        sums["conv5_1"].sum().backward()
+    sums = encoder.gram_sums(given, masks)
+    unused = weakref.ref(sums["conv5_1"].grad_fn)
+    del sums
     assert unused() is None
     assert kept() is None
 

@@ -1,8 +1,10 @@
+import copy
+
 import pytest
 import torch
 
 from styleexp.config import LossConfig
-from styleexp.encoders import load_encoder
+from styleexp.encoders import Encoder, load_encoder
 from styleexp.losses import StyleLoss, gram_matrix, layer_mask
 from styleexp.viewer import Images
 
@@ -55,6 +57,22 @@ def test_the_papers_layers_by_index_and_by_name_are_the_same(encoder):
     by_index = StyleLoss(LossConfig(layers=[1, 3, 5, 9, 13]), encoder)
     by_name = StyleLoss(LossConfig(), encoder)
     assert by_index.layers == by_name.layers
+
+
+def test_an_encoder_that_serves_other_activations_is_asked_for_them(encoder):
+    class Doubled(Encoder):
+        def forward(self, images, layers):
+            return {name: 2 * found for name, found in super().forward(images, layers).items()}
+
+    other = copy.copy(encoder)
+    other.__class__ = Doubled
+    images, disc = torch.rand(2, 64, 64, 1), torch.zeros(2, 64, 64)
+    disc[:, 5:60, 9:] = 1
+    for config in (LossConfig(masked=False), LossConfig(erosion=0)):
+        ours, theirs = (grams(StyleLoss(config, each), images, disc) for each in (encoder, other))
+        for single, doubled in zip(ours, theirs, strict=True):
+            assert single.any()
+            torch.testing.assert_close(4 * single, doubled, rtol=1e-4, atol=1e-5)
 
 
 def test_distance_is_zero_at_the_target_and_weights_blocks(encoder):

@@ -26,7 +26,7 @@ API = {
                   "renderers.soft_raster.raster", "renderers.soft_raster.contour",
                   "renderers.soft_raster.shading", "renderers.soft_raster.deferred",
                   "renderers.mitsuba_ad", "renderers.moderngl_deferred", "testing"),
-    "Encoders": ("encoders", "encoders.vgg", "encoders.clip", "encoders.weights"),
+    "Encoders": ("encoders", "encoders.vgg", "encoders.fused", "encoders.clip", "encoders.weights"),
     "Parts and plugins": ("registry", "plugins", "loggers", "errors"),
     "Runs, metrics, reports": ("records", "metrics", "metrics.style", "metrics.shape",
                                "metrics.truth", "reports", "reports.collect",

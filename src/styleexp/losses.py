@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
+from styleexp.encoders import Encoder
 from styleexp.errors import UserError
 
 if TYPE_CHECKING:
@@ -15,7 +18,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from styleexp.config import LossConfig
-    from styleexp.encoders import Encoder
     from styleexp.encoders.clip import ClipEncoder
     from styleexp.viewer import Images
 
@@ -33,12 +35,18 @@ def gram_matrix(
     per layer, averaged over views. With a mask, only its cells are summed and counted, so the share
     of the frame that the object fills doesn't matter. An empty mask gives zeros.
     """
-    views, channels, height, width = features.shape
-    if mask is None:
-        count = torch.tensor(views * height * width, device=features.device)
-    else:
-        count = mask.sum().clamp(min=1)
-    return _Gram.apply(features, mask) / (channels * count)
+    cells = features[:, 0].numel()
+    return mean_gram(_Gram.apply(features, mask), mask, cells)
+
+
+def mean_gram(
+    total: Float[Tensor, "channels channels"],
+    mask: Bool[Tensor, "views height width"] | None,
+    cells: int,
+) -> Float[Tensor, "channels channels"]:
+    """A sum of F^T F over the masked ones of so many cells, divided by channels x cells."""
+    count = cells if mask is None else mask.sum().clamp(min=1)
+    return total / (len(total) * count)
 
 
 class _Gram(torch.autograd.Function):
@@ -90,15 +98,28 @@ class StyleLoss:
 
     def grams(self, seen: Images) -> Grams:
         """One Gram per style layer, over the foreground alone if so configured."""
-        features = self.encoder(seen.image.permute(0, 3, 1, 2), self.layers)
-        grams = []
-        for layer in self.layers:
-            mask = None
-            if self.config.masked:
-                height, width = features[layer].shape[2:]
-                mask = layer_mask(seen.coverage, (height, width), self.config.erosion)
-            grams.append(gram_matrix(features[layer], mask))
-        return grams
+        images = seen.image.permute(0, 3, 1, 2)
+        # A subclass may serve other activations than those that ours takes the sums of.
+        if type(self.encoder) is Encoder and self.encoder.is_fused:
+            cells = {
+                name: tuple(size // self.encoder.stride(name) for size in images.shape[2:])
+                for name in self.layers
+            }
+            masks = {name: self._mask(seen, shape) for name, shape in cells.items()}
+            sums = self.encoder.gram_sums(images, masks)
+            return [
+                mean_gram(sums[name], masks[name], len(images) * math.prod(shape))
+                for name, shape in cells.items()
+            ]
+        features = self.encoder(images, self.layers)
+        found = [features[name] for name in self.layers]
+        return [gram_matrix(each, self._mask(seen, each.shape[2:])) for each in found]
+
+    def _mask(self, seen: Images, cells: Sequence[int]) -> Bool[Tensor, "n rows columns"] | None:
+        """Which cells of a layer of this size count."""
+        if not self.config.masked:
+            return None
+        return layer_mask(seen.coverage, (cells[0], cells[1]), self.config.erosion)
 
     def distance(self, grams: Grams, target: Grams, scales: list[Tensor]) -> Float[Tensor, ""]:
         """Weighted sum over layers of the squared Frobenius distance (Eq. 8), each divided by its

@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from styleexp.encoders import fused
 from styleexp.renderers.soft_raster import SoftRaster, deferred, shading
 
 OTHER = "other"
@@ -52,8 +53,8 @@ class Parts:
 
         @wraps(function)
         def run(*given: Any, **named: Any) -> Any:
-            if len(self.within) == 1:
-                self.turn(OTHER)  # the backward pass is over
+            if len(self.within) == 1 and torch.is_grad_enabled():
+                self.turn(OTHER)  # the backward pass, which takes no gradients itself, is over
             around = self.within[-1]
             self._count()
             self.within.append(name)
@@ -141,6 +142,11 @@ def timed_stages(clock: Parts, stages: Sequence[tuple[str, Any, str]]) -> Iterat
 
 
 NORMALS = [("normals", deferred, "FaceNormals"), ("normals", shading, "vertex_normals")]
+GRAMS = [
+    ("Gram matrices", fused, "gram"),
+    (f"Gram matrices{BACKWARD}", fused, "add_gram_gradient"),
+]
+"""Within the encoder's own step."""
 STAGES = [
     *NORMALS,
     ("projection", deferred, "Project"),

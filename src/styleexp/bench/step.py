@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
@@ -14,7 +14,7 @@ import torch
 from styleexp import baselines
 from styleexp.bench.floor import Call, encoder_floor
 from styleexp.bench.measuring import machine, peak_memory_mb
-from styleexp.bench.parts import BACKWARD, NORMALS, OTHER, Parts, timed_stages
+from styleexp.bench.parts import BACKWARD, GRAMS, NORMALS, OTHER, Parts, timed_stages
 from styleexp.compose import compose
 from styleexp.encoders import Encoder
 from styleexp.errors import UserError
@@ -27,6 +27,7 @@ FORWARD = (
     "render",
     "image views",
     "encoder",
+    "Gram matrices",
     "loss",
     "target",
     "optimiser",
@@ -73,6 +74,8 @@ def measure(
     for name in ("render", "render_lights"):
         clock.wrap("render", scene.viewer.renderer, name)
     clock.wrap("encoder", scene.loss, "encoder")
+    if hasattr(scene.loss.encoder, "gram_sums"):
+        clock.wrap("encoder", scene.loss.encoder, "gram_sums")
     for name in ("grams", "distance"):
         clock.wrap("loss", scene.loss, name)
     for name in ("step", "zero_grad"):
@@ -84,7 +87,7 @@ def measure(
     timed = replace(scene, viewer=views, target=target)  # type: ignore[arg-type]
 
     rows: list[dict[str, tuple[float, float]]] = []
-    with tempfile.TemporaryDirectory() as name, timed_stages(clock, NORMALS):
+    with tempfile.TemporaryDirectory() as name, timed_stages(clock, [*NORMALS, *GRAMS]):
         folder = RunFolder(Path(name))
         loop = method.optimise(timed, state)
         log = clock.timed("logging", lambda step: _log(folder, step, state, config))
@@ -114,12 +117,19 @@ def _log(folder: RunFolder, step: Any, state: Any, config: Any) -> None:
 def _note_calls(encoder: Any) -> list[Call]:
     """A list that each call of the encoder is added to."""
     calls: list[Call] = []
+
+    def note(images: torch.Tensor, layers: Iterable[str]) -> None:
+        calls.append((tuple(images.shape), tuple(layers), images.requires_grad))
+
     if isinstance(encoder, Encoder):
-        encoder.register_forward_pre_hook(
-            lambda _, given: calls.append(
-                (tuple(given[0].shape), tuple(given[1]), given[0].requires_grad)
-            )
-        )
+        encoder.register_forward_pre_hook(lambda _, given: note(*given[:2]))
+        sums = encoder.gram_sums
+
+        def noted(images: torch.Tensor, masks: Any) -> Any:
+            note(images, masks)
+            return sums(images, masks)
+
+        encoder.gram_sums = noted  # type: ignore[method-assign]
     return calls
 
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
+from styleexp.encoders import fused
 from styleexp.encoders.weights import (
     IMAGENET_MEAN,
     IMAGENET_STD,
@@ -22,7 +22,7 @@ from styleexp.encoders.weights import (
 from styleexp.errors import UserError, unknown_name
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
 
 log = logging.getLogger(__name__)
 
@@ -33,9 +33,6 @@ PAPER_LAYERS = layer_names(VGG19_CONVS)
 """The paper's index i is PAPER_LAYERS[i - 1]: 1 = conv1_1, 5 = conv3_1, 13 = conv5_1."""
 PAPER_MEAN = (0.481, 0.458, 0.408)
 PAPER_STD = (0.268, 0.261, 0.276)
-
-FUSED = (torch.float32, torch.bfloat16)
-"""What oneDNN fuses a convolution and a ReLU in."""
 
 _PRECISION_NAMES = {torch.float32: "fp32", torch.bfloat16: "bf16", torch.float64: "fp64"}
 
@@ -88,6 +85,7 @@ class Encoder(nn.Module):
         self.register_buffer("std", torch.tensor(std or weights.std).view(1, 3, 1, 1))
         self.requires_grad_(False)
         self.eval()
+        self._turned: dict[str, tuple[Any, Tensor]] = {}
 
     @property
     def precision(self) -> str:
@@ -159,6 +157,62 @@ class Encoder(nn.Module):
             ValueError: another shape or an integer type.
         """
         names = self.resolve(layers)
+        x, run = self._prepare(images, names)
+        served: dict[str, Tensor] = {}
+        for before, layer in itertools.pairwise((run[0], *run)):
+            if _position(layer)[0] != _position(before)[0]:
+                pool = functional.max_pool2d if self.pooling == "max" else functional.avg_pool2d
+                x = pool(x, 2)
+            # In place on the convolution's own output, which nothing else needs; what comes next
+            # makes a new tensor, so served activations stay as they are.
+            x = self.convs[layer](x).relu_()
+            served[layer] = x
+        return {name: served[name] for name in names}
+
+    @property
+    def is_fused(self) -> bool:
+        """Whether `gram_sums` can be used: on a CPU with oneDNN, in fp32 or bf16."""
+        weight = next(self.convs.parameters())
+        has = weight.device.type == "cpu" and torch.backends.mkldnn.is_available()
+        return has and weight.dtype in fused.BITS
+
+    def gram_sums(
+        self,
+        images: Float[Tensor, "images channels height width"],
+        masks: Mapping[str, Bool[Tensor, "images rows columns"] | None],
+    ) -> dict[str, Float[Tensor, "features features"]]:
+        """F^T F of the activations that ``forward`` gives, which are not kept: much cheaper.
+
+        Args:
+            images: as for ``forward``.
+            masks: for each layer, by its resolved name, which cells are summed; None is all.
+
+        Returns:
+            Name -> the sum over images and cells in float32, in the order of ``masks``. It has one
+            backward pass.
+
+        Raises:
+            as ``forward``.
+        """
+        x, run = self._prepare(images, tuple(masks))
+        blocks = [
+            [self._layer(name) for name in block]
+            for _, block in itertools.groupby(run, lambda name: _position(name)[0])
+        ]
+        found = fused.GramSums.apply(x, blocks, masks, self.pooling)
+        return dict(zip(masks, found, strict=True))
+
+    def _layer(self, name: str) -> fused.Layer:
+        """A convolution for `gram_sums`; the turned kernel is kept for the next."""
+        weight, bias = (self.convs[name].get_parameter(each) for each in ("weight", "bias"))
+        now = weight.data_ptr(), weight._version, weight.dtype
+        if name not in self._turned or self._turned[name][0] != now:
+            back = weight.detach().flip(2, 3).transpose(0, 1)
+            self._turned[name] = now, back.contiguous(memory_format=torch.channels_last)
+        return fused.Layer(name, weight, bias, self._turned[name][1])
+
+    def _prepare(self, images: Tensor, names: tuple[str, ...]) -> tuple[Tensor, tuple[str, ...]]:
+        """Normalised images in the compute dtype, channels last, and the layers to run."""
         if images.ndim != 4 or images.shape[1] not in (1, 3) or not images.is_floating_point():
             raise ValueError(
                 "images must be floats of shape (images, 1 or 3, height, width), not "
@@ -171,98 +225,11 @@ class Encoder(nn.Module):
                 f"images of {width}x{height} pixels are too small for the layer {deepest} of "
                 f"'{self.name}': it needs at least {self.stride(deepest)} pixels on each side."
             )
-
         dtype = next(self.convs.parameters()).dtype
         # Normalised before rounding to the compute dtype: near the mean bf16 is then finest. A grey
         # image becomes three channels here; collapsing the first kernel instead saves no time.
         x = ((images - self.mean) / self.std).to(dtype, memory_format=torch.channels_last)
-        run = self.layer_names[: self.layer_names.index(deepest) + 1]
-        if x.device.type == "cpu" and dtype in FUSED and torch.backends.mkldnn.is_available():
-            convs = [(self.convs[layer].weight, self.convs[layer].bias) for layer in run]
-            found = _Fused.apply(x, convs, run, names, self.pooling)
-            served = dict(zip(sorted(names, key=_position), found, strict=True))
-        else:
-            served = self._plain(x, run)
-        return {name: served[name] for name in names}
-
-    def _plain(self, x: Tensor, run: Sequence[str]) -> dict[str, Tensor]:
-        """All layers of ``run``, one operation after another."""
-        served: dict[str, Tensor] = {}
-        for before, layer in itertools.pairwise((run[0], *run)):
-            if _position(layer)[0] != _position(before)[0]:
-                pool = functional.max_pool2d if self.pooling == "max" else functional.avg_pool2d
-                x = pool(x, 2)
-            # In place on the convolution's own output, which nothing else needs; what comes next
-            # makes a new tensor, so served activations stay as they are.
-            x = self.convs[layer](x).relu_()
-            served[layer] = x
-        return served
-
-
-class _Fused(torch.autograd.Function):
-    """The network as one step, on a CPU with oneDNN: the same numbers as ``Encoder._plain``.
-
-    A convolution and its ReLU are one pass over the memory. Backward, gradients are masked and
-    added up in place, and each activation is freed as soon as it has been used: most of what
-    autograd takes besides the convolutions goes into fresh memory. Below a max-pooling the ReLU's
-    mask is applied to the pooled gradient, a quarter of the size, where there is no other.
-    """
-
-    @staticmethod
-    def forward(ctx, x, convs, run, names, pooling):
-        fused = torch.ops.mkldnn._convolution_pointwise
-        steps, served, block = [], [], _position(run[0])[0]
-        for layer, (weight, bias) in zip(run, convs, strict=True):
-            where = None
-            is_pooled = _position(layer)[0] != block
-            if is_pooled:
-                block = _position(layer)[0]
-                if pooling == "max":
-                    x, where = torch.ops.aten.max_pool2d_with_indices(x, [2, 2], [2, 2])
-                else:
-                    x = functional.avg_pool2d(x, 2)
-            out = fused(x, weight, bias, [1, 1], [1, 1], [1, 1], 1, "relu", [], "")
-            if layer in names:
-                served.append(out)
-            if ctx.needs_input_grad[0]:  # detached: an output that held this would never be freed
-                steps.append((x, weight, out.detach(), layer in names, is_pooled, where))
-            x = steps[-1][2] if steps else out
-        ctx.steps = steps
-        return tuple(served)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, *served):
-        steps, grads, one = ctx.steps, list(served), [1, 1]
-        if not steps:
-            raise RuntimeError("the encoder frees its activations: it has no second backward pass")
-        grad, is_masked = torch.zeros_like(steps[-1][2]), False
-        while steps:
-            x, weight, out, is_served, is_pooled, where = steps.pop()
-            if is_served:
-                grad.add_(grads.pop())
-            if not is_masked:
-                _mask(grad, out)
-            grad, _, _ = torch.ops.aten.convolution_backward(
-                grad, x, weight, None, one, one, one, False, [0, 0], 1, [True, False, False]
-            )
-            is_masked = where is not None and not steps[-1][3]
-            if is_masked:
-                _mask(grad, x)
-            if where is not None:
-                grad = torch.ops.aten.max_pool2d_with_indices_backward(
-                    grad, steps[-1][2], [2, 2], [2, 2], [0, 0], one, False, where
-                )
-            elif is_pooled:
-                grad = torch.ops.aten.avg_pool2d_backward(
-                    grad, steps[-1][2], [2, 2], [2, 2], [0, 0], False, True, None
-                )
-        return grad, None, None, None, None
-
-
-def _mask(grad: Tensor, activation: Tensor) -> None:
-    """Set the gradient to 0 where the ReLU did, in place."""
-    torch.ops.aten.threshold_backward.grad_input(grad, activation, 0, grad_input=grad)
+        return x, self.layer_names[: self.layer_names.index(deepest) + 1]
 
 
 def _position(layer: str) -> tuple[int, int]:

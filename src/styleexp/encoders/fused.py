@@ -1,0 +1,192 @@
+"""Gram matrices of a VGG's layers as one autograd step, on a CPU with oneDNN.
+
+Most of what autograd takes besides the convolutions goes into passes over fresh memory: masked
+copies, gradients of each layer by itself, sums of them. Here a convolution and its ReLU are one
+pass, a layer's Gram matrix is taken while its activations are at hand, and its gradient is added
+to that of the layers above by the very product that makes it. Images go through a block in parts,
+so that no array is so large that the allocator would give it back to the system after use and
+fetch fresh pages for the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+from torch.nn import functional
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+    Mask = Bool[Tensor, "images rows columns"] | None
+
+BITS = {torch.float32: torch.int32, torch.bfloat16: torch.int16}
+"""What can be fused, and integers of the same size. Activations are never negative, so they order
+as their bits do, and torch is three times as fast with 16-bit integers as with bfloat16."""
+
+PART = 16 << 20
+"""Bytes of a part's activations. glibc maps arrays above 32 MB anew each time."""
+ROWS = 2048
+"""Cells whose product is rounded at once; the sums of those are float32's."""
+
+_ONE = [1, 1]
+
+
+class Layer(NamedTuple):
+    """A convolution; ``back`` is the kernel that takes its gradient back to its input."""
+
+    name: str
+    weight: Float[Tensor, "out in 3 3"]
+    bias: Float[Tensor, " out"]
+    back: Float[Tensor, "in out 3 3"]
+
+
+@dataclass
+class _Part:
+    """What the backward pass needs of some images in a block."""
+
+    images: slice
+    activations: list[Tensor] = field(default_factory=list)
+    where: Tensor | None = None
+    """Of a max-pooling: which cell each value is from."""
+
+
+class GramSums(torch.autograd.Function):
+    """F^T F of layers, summed over images and masked cells, in the order of ``masks``.
+
+    Takes normalised images (channels last), the layers block by block, for each layer asked for
+    its mask or None, and ``max`` or ``avg``. The last layer must be one asked for.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        images: Tensor,
+        blocks: Sequence[Sequence[Layer]],
+        masks: Mapping[str, Mask],
+        pooling: str,
+    ) -> tuple[Tensor, ...]:
+        """Block by block; within a block part by part."""
+        sums: dict[str, list[Tensor]] = {name: [] for name in masks}
+        ctx.kept, ctx.given = [], (blocks, masks, pooling)
+        x = images
+        for block in blocks:
+            parts, pooled = [], []
+            for now, part in _split(x, len(block[0].bias)):
+                parts.append(_Part(now))
+                for layer in block:
+                    part = _convolve(part, layer.weight, layer.bias, "relu")
+                    if layer.name in masks:
+                        sums[layer.name].append(gram(part, _at(masks[layer.name], now)))
+                    if ctx.needs_input_grad[0]:
+                        parts[-1].activations.append(part)
+                if block is not blocks[-1]:
+                    part, parts[-1].where = _pool(part, pooling)
+                    pooled.append(part)
+            x = torch.cat(pooled) if pooled else part
+            if ctx.needs_input_grad[0]:
+                ctx.kept.append((parts, x))
+        return tuple(torch.stack(found).sum(0) for found in sums.values())
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        """Frees activations as it goes, so there is no second one."""
+        if not ctx.kept:
+            raise RuntimeError("the encoder frees its activations: it has no second backward pass")
+        blocks, masks, pooling = ctx.given
+        factors = {name: grad + grad.t() for name, grad in zip(masks, grads, strict=True)}
+        grad: Tensor | None = None
+        for block in reversed(blocks):
+            parts, pooled = ctx.kept.pop()
+            is_off = pooling == "max" and block[-1].name not in masks
+            if grad is not None and is_off:
+                # Off after a max-pooling is off before it, where there are four times as many.
+                zero_where_zero(grad, pooled)
+            del pooled
+            into = []
+            while parts:
+                part = parts.pop(0)
+                last = part.activations[-1]
+                if grad is None:
+                    here = torch.zeros_like(last)
+                else:
+                    here = _unpool(grad[part.images], last, part.where, pooling)
+                for layer in reversed(block):
+                    activation = part.activations.pop()
+                    if layer.name in masks:
+                        mask = _at(masks[layer.name], part.images)
+                        add_gram_gradient(here, activation, mask, factors[layer.name])
+                    if layer is not block[-1] or not is_off:
+                        zero_where_zero(here, activation)
+                    here = _convolve(here, layer.back, None, "none")
+                into.append(here)
+            grad = torch.cat(into)
+        return grad, None, None, None
+
+
+def gram(activation: Tensor, mask: Mask) -> Float[Tensor, "channels channels"]:
+    """F^T F over masked cells. Summed in float32 every ``ROWS`` cells: bfloat16's own rounding, of
+    products of so many, stays below 0.2 %."""
+    cells = activation.permute(0, 2, 3, 1).flatten(0, 2)
+    if mask is not None:
+        cells = cells.index_select(0, mask.flatten().nonzero().view(-1))
+    total = torch.zeros(cells.shape[1], cells.shape[1])
+    for some in cells.split(ROWS):
+        total += some.t() @ some
+    return total
+
+
+def add_gram_gradient(grad: Tensor, activation: Tensor, mask: Mask, factor: Tensor) -> None:
+    """Add F (D + D^T), 0 outside of the mask, to the gradient in place."""
+    cells = activation.permute(0, 2, 3, 1)
+    if mask is not None:
+        bits = cells.view(BITS[activation.dtype]) * mask[..., None]
+        cells = bits.view(activation.dtype)
+    rows = grad.permute(0, 2, 3, 1).flatten(0, 2)
+    rows.addmm_(cells.flatten(0, 2), factor.to(activation.dtype))
+
+
+def zero_where_zero(grad: Tensor, activation: Tensor) -> None:
+    """Set the gradient to 0 where the ReLU did, in place."""
+    bits = BITS[activation.dtype]
+    out = grad.view(bits)
+    torch.ops.aten.threshold_backward.grad_input(out, activation.view(bits), 0, grad_input=out)
+
+
+def _split(x: Tensor, channels: int) -> Iterator[tuple[slice, Tensor]]:
+    """As many images at once as make ``PART`` bytes of this many channels."""
+    size = channels * x.shape[2] * x.shape[3] * x.element_size()
+    step = max(1, PART // size)
+    for start in range(0, len(x), step):
+        now = slice(start, start + step)
+        yield now, x[now]
+
+
+def _pool(x: Tensor, pooling: str) -> tuple[Tensor, Tensor | None]:
+    if pooling == "max":
+        return torch.ops.aten.max_pool2d_with_indices(x, [2, 2], [2, 2])
+    return functional.avg_pool2d(x, 2), None
+
+
+def _unpool(grad: Tensor, x: Tensor, where: Tensor | None, pooling: str) -> Tensor:
+    """The gradient of ``_pool``."""
+    if pooling == "max":
+        return torch.ops.aten.max_pool2d_with_indices_backward(
+            grad, x, [2, 2], [2, 2], [0, 0], _ONE, False, where
+        )
+    return torch.ops.aten.avg_pool2d_backward(grad, x, [2, 2], [2, 2], [0, 0], False, True, None)
+
+
+def _at(mask: Mask, images: slice) -> Mask:
+    return None if mask is None else mask[images]
+
+
+def _convolve(x: Tensor, weight: Tensor, bias: Tensor | None, then: str) -> Tensor:
+    """A 3x3 convolution with padding 1, ``then`` a ``relu`` or ``none``, in one pass."""
+    convolution = torch.ops.mkldnn._convolution_pointwise
+    return convolution(x, weight, bias, _ONE, _ONE, _ONE, 1, then, [], "")
