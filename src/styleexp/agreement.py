@@ -11,6 +11,7 @@ import statistics
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from styleexp import atomic
 from styleexp.sweeps import report
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ class OnSweepEnd(report.OnSweep):
         """Compare the runs in the sweep's folder; those that failed are listed as failed."""
         folder = Path(config.hydra.sweep.dir)
         rows = compare(folder)
-        (folder / "agreement.json").write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+        atomic.write(folder / "agreement.json", atomic.text(json.dumps(rows, indent=2) + "\n"))
         _print_table(rows, folder)
 
 
@@ -156,7 +157,7 @@ def _draw(pictures: list[tuple[dict[str, Any], np.ndarray]], path: Path) -> None
             dark = [Image.fromarray(v) for v in gap.clip(0, 255).astype(np.uint8)]
             label = f"{row['renderer']}: difference from {pictures[0][0]['renderer']}"
             rows.append((f"{label}, {DIFFERENCE_GAIN} times as dark", dark))
-    sheet(rows, views.shape[1]).save(path)
+    atomic.write(path, lambda at: sheet(rows, views.shape[1]).save(at))
 
 
 def _print_table(rows: list[dict[str, Any]], folder: Path) -> None:

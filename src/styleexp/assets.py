@@ -33,6 +33,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+from styleexp import atomic
 from styleexp.errors import UserError, unknown_name
 
 if TYPE_CHECKING:
@@ -288,7 +289,10 @@ def fetch(name: str) -> Path:
             # Another process may have put it there while this one waited.
             if (path := _converted(asset, quiet=True)) is not None:
                 return path
-            with tempfile.TemporaryDirectory(prefix=".fetch-", dir=target.parent) as scratch:
+            # Other weights have another lock, so what is young may be theirs.
+            atomic.sweep(target.parent, seconds=atomic.A_DAY)
+            prefix = f".fetch{atomic.MARK}-"
+            with tempfile.TemporaryDirectory(prefix=prefix, dir=target.parent) as scratch:
                 _convert(asset, _published(asset) or _download(asset, Path(scratch)), target)
     except OSError as error:
         raise UserError(

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from styleexp import atomic
 from styleexp.errors import UserError
 from styleexp.meshes import vertex_normals
 
@@ -194,12 +195,12 @@ def write(maps: Maps, folder: Path, kind: str) -> dict[str, Any]:
             normal: png(_sixteen(encoded)),
         }
         for path, content in files.items():
-            _replace(path, lambda at, content=content: at.write_bytes(content))
+            atomic.write(path, lambda at, content=content: at.write_bytes(content))
     else:
         scale, level = 1.0, 0.0
-        _replace(height, lambda at: _write_exr(at, {"Y": maps.height}))
+        atomic.write(height, lambda at: _write_exr(at, {"Y": maps.height}))
         channels = {name: encoded[..., k] for k, name in enumerate("RGB")}
-        _replace(normal, lambda at: _write_exr(at, channels))
+        atomic.write(normal, lambda at: _write_exr(at, channels))
     return {
         "size": len(maps.height),
         "height": {
@@ -220,15 +221,6 @@ def write(maps: Maps, folder: Path, kind: str) -> dict[str, Any]:
         "covered": round(float(maps.covered.mean()), 4),
         "overlap": round(maps.overlap, 4),
     }
-
-
-def _replace(path: Path, write_to: Any) -> None:
-    partial = path.with_name(f".{path.stem}.partial{path.suffix}")
-    try:
-        write_to(partial)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _sixteen(values: np.ndarray) -> np.ndarray:

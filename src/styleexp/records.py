@@ -1,23 +1,24 @@
 """A run's folder: its status, its record, its metrics, its checkpoints.
 
-Every file but ``metrics.jsonl`` is written whole or not at all: to a temporary name beside it, then
-moved over it.
+Every file but ``metrics.jsonl``, which grows by a line a step, is written whole or not at all.
 """
 
 from __future__ import annotations
 
+import copy
 import importlib.metadata
 import json
 import os
 import platform
 import shutil
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from styleexp import plugins
+from styleexp import atomic, digests, plugins
 from styleexp.errors import UserError
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ FILES = (
     "metrics.jsonl",
     "checkpoint.safetensors",
     "checkpoint.previous.safetensors",
+    "checkpoint.damaged.safetensors",
     "result.ply",
     "result.obj",
     "result.glb",
@@ -80,22 +82,11 @@ class RunFolder:
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
         """Write a JSON file whole."""
-        text = json.dumps(content, indent=2, default=str) + "\n"
-        self.write(name, lambda path: path.write_text(text, encoding="utf-8"))
+        self.write(name, atomic.text(json.dumps(content, indent=2, default=str) + "\n"))
 
     def write(self, name: str, writer: Callable[[Path], Any]) -> Path:
-        """Let ``writer`` write a file under a temporary name, then move it into place."""
-        target = self.path / name
-        # The suffix stays last: writers choose the format by it.
-        partial = target.with_name(f".{target.stem}.{os.getpid()}.partial{target.suffix}")
-        try:
-            writer(partial)
-            with open(partial, "rb") as written:
-                os.fsync(written.fileno())
-            os.replace(partial, target)
-        finally:
-            partial.unlink(missing_ok=True)
-        return target
+        """Let ``writer`` write a file, whole or not at all."""
+        return atomic.write(self.path / name, writer)
 
     def unfinished(self, record: Mapping[str, Any]) -> dict[str, Any] | None:
         """The record of this folder's run if it is the same as ``record``'s and not done."""
@@ -130,7 +121,7 @@ class RunFolder:
                     kept.append(line + "\n")
             except (ValueError, KeyError, TypeError):
                 continue  # a line cut off by the interruption
-        self.write("metrics.jsonl", lambda path: path.write_text("".join(kept), encoding="utf-8"))
+        self.write("metrics.jsonl", atomic.text("".join(kept)))
 
     def save_checkpoint(self, state: State) -> None:
         """Field, optimiser and step in one safetensors file; the one before is kept beside it."""
@@ -139,11 +130,18 @@ class RunFolder:
         tensors = {f"field.{k}": v.contiguous() for k, v in state.field.state_dict().items()}
         for index, slots in state.optimizer.state_dict()["state"].items():
             tensors |= {f"adam.{index}.{k}": v.contiguous() for k, v in slots.items()}
-        metadata = {"schema": str(SCHEMA), "step": str(state.step)}
+        step = str(state.step)
+        metadata = {"schema": str(SCHEMA), "step": step, "digest": digests.of(tensors, step)}
         content = save(tensors, metadata=metadata)
+        self._sync_metrics()
         if self.checkpoint.exists():
             os.replace(self.checkpoint, self.path / "checkpoint.previous.safetensors")
         self.write("checkpoint.safetensors", lambda path: path.write_bytes(content))
+
+    def _sync_metrics(self) -> None:
+        """A checkpoint on the disk means that the lines of its steps are there, too."""
+        with suppress(FileNotFoundError), open(self.metrics, "rb") as lines:
+            os.fsync(lines.fileno())
 
     def checkpoint_step(self) -> int | None:
         """The step of the latest checkpoint; None where there is none that can be read."""
@@ -156,21 +154,27 @@ class RunFolder:
             return None
 
     def load_checkpoint(self, state: State) -> str | None:
-        """Bring ``state`` to the latest readable checkpoint; returns what to tell the user.
+        """Bring ``state`` to the latest whole checkpoint; returns what to tell the user.
 
-        A damaged checkpoint is passed over for the one before it. With none, ``state`` stays as it
+        A damaged checkpoint is put aside for the one before it. With none, ``state`` stays as it
         is, at step 0.
         """
-        told = None
+        begun, damaged = copy.deepcopy(state.field.state_dict()), []
         for path in (self.checkpoint, self.path / "checkpoint.previous.safetensors"):
             if not path.exists():
                 continue
             try:
                 _restore(path, state)
-                return told
+                break
             except Exception as damage:  # safetensors raises several kinds
-                told = f"{path} is damaged ({damage}); the checkpoint before it is used."
-        return told
+                state.field.load_state_dict(begun)
+                damaged.append(f"{path} is damaged ({first_line(damage)})")
+                if path == self.checkpoint:  # the next one saved must not take the good one's place
+                    os.replace(path, self.path / "checkpoint.damaged.safetensors")
+        if not damaged:
+            return None
+        used = "the checkpoint before it is used" if state.step else "the run begins anew"
+        return f"{', and '.join(damaged)}; {used}."
 
 
 def essence(config: Mapping[str, Any]) -> Any:
@@ -195,8 +199,12 @@ def _restore(path: Path, state: State) -> None:
     from safetensors import safe_open
 
     with safe_open(path, framework="pt") as opened:
-        step = int(opened.metadata()["step"])
+        metadata = opened.metadata()
+        step = int(metadata["step"])
         tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+    # The first checkpoints had no digest.
+    if metadata.get("digest", "") not in ("", digests.of(tensors, metadata["step"])):
+        raise ValueError("its content does not match its digest")
     device = next(state.field.parameters()).device
     weights = {k[6:]: v.to(device) for k, v in tensors.items() if k.startswith("field.")}
     slots: dict[int, dict[str, Any]] = {}

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from styleexp import assets, plugins
+from styleexp import assets, atomic, digests, plugins
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -76,33 +76,34 @@ def _code() -> bytes:
 
 
 def _read(path: Path, encoder: Encoder) -> tuple[Grams, Grams] | None:
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
+    from safetensors import SafetensorError, safe_open
 
     try:
-        tensors = load_file(path, device=str(encoder.mean.device))
-        os.utime(path)
-    except (OSError, SafetensorError):
+        with safe_open(path, framework="pt") as opened:
+            told = opened.metadata()["digest"]
+            tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+    except (OSError, SafetensorError, KeyError, TypeError):
         return None
-    names = sorted(tensors)
-    whole, local = ([tensors[n] for n in names if n.startswith(k)] for k in ("global", "local"))
+    if digests.of(tensors) != told:
+        return None
+    with suppress(OSError):  # a cache that is read-only
+        os.utime(path)
+    ordered = [(name, tensors[name].to(encoder.mean.device)) for name in sorted(tensors)]
+    whole, local = ([t for n, t in ordered if n.startswith(k)] for k in ("global", "local"))
     return whole, local
 
 
 def _write(path: Path, found: tuple[Grams, Grams]) -> None:
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     tensors: dict[str, Tensor] = {}
     for kind, each in zip(("global", "local"), found, strict=True):
         tensors |= {f"{kind}.{i:02d}": gram.contiguous().cpu() for i, gram in enumerate(each)}
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
+    content = save(tensors, {"digest": digests.of(tensors)})
+    with suppress(OSError):  # a run needs no cache
         path.parent.mkdir(parents=True, exist_ok=True)
-        save_file(tensors, partial)
-        os.replace(partial, path)
-        files = sorted(path.parent.glob("*.safetensors"), key=lambda p: p.stat().st_mtime)
+        atomic.sweep(path.parent, seconds=atomic.A_DAY)
+        atomic.write(path, lambda at: at.write_bytes(content))
+        files = sorted(path.parent.glob("[!.]*.safetensors"), key=lambda p: p.stat().st_mtime)
         for old in files[:-KEPT]:
             old.unlink(missing_ok=True)
-    except OSError:  # a run needs no cache
-        with suppress(OSError):
-            partial.unlink()

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from styleexp import atomic
 from styleexp.errors import UserError
 
 DESCRIPTION = """\
@@ -68,7 +69,7 @@ def bake(folder: Path, size: int, kind: str, out: Path | None = None) -> list[Pa
     target = out or folder / "bake"
     target.mkdir(parents=True, exist_ok=True)
     told = {"run": str(folder), "source": source.name, **baking.write(maps, target, kind)}
-    (target / "bake.json").write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
+    atomic.write(target / "bake.json", atomic.text(json.dumps(told, indent=2) + "\n"))
     return [target / name for name in (f"height.{kind}", f"normal.{kind}", "bake.json")]
 
 

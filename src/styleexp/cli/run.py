@@ -7,12 +7,12 @@ import random
 import signal
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from styleexp import locks, records
+from styleexp import atomic, locks, records
 from styleexp.errors import UserError
 
 if TYPE_CHECKING:
@@ -80,10 +80,15 @@ def _alone(folder: Path) -> Iterator[None]:
         with locks.hold(folder, LOCK_PATIENCE):
             yield
     except locks.Busy:
-        raise UserError(
-            f"another process is at work in '{folder}': wait for it, or choose another folder with "
-            "hydra.run.dir=FOLDER."
-        ) from None
+        raise UserError(busy(folder)) from None
+
+
+def busy(folder: Path) -> str:
+    """What is said of a folder that another process holds."""
+    return (
+        f"another process is at work in '{folder}': wait for it, or choose another folder with "
+        "hydra.run.dir=FOLDER."
+    )
 
 
 @cache
@@ -115,6 +120,7 @@ def _guarded(
     config: Config, folder: records.RunFolder, record: dict[str, Any], resumed: bool
 ) -> int:
     """Run, and leave a status whatever happens."""
+    atomic.sweep(folder.path)
     try:
         folder.write_status("running")
         if not resumed:
@@ -125,6 +131,11 @@ def _guarded(
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
+        if not folder.path.is_dir():
+            raise UserError(
+                f"the run's folder '{folder.path}' was removed while the run was at work: start "
+                "the run anew."
+            ) from error
         _fail(folder, str(error))
         raise UserError(
             f"writing to '{folder.path}' failed ({error.strerror or error}): free some space or "
@@ -135,14 +146,26 @@ def _guarded(
         raise
     except Exception as error:
         _fail(folder, str(error))
+        if _out_of_memory(error):
+            raise UserError(
+                f"there is not enough memory for this run ({records.first_line(error)}): take "
+                "fewer or smaller views (views.count, views.local.count, views.resolution), a mesh "
+                "with fewer faces, or fewer runs at once."
+            ) from error
         raise
 
 
+def _out_of_memory(error: BaseException) -> bool:
+    """Whether Python, torch's CPU allocator or CUDA had no memory left."""
+    import torch
+
+    kinds = (MemoryError, torch.OutOfMemoryError)
+    return isinstance(error, kinds) or "can't allocate memory" in str(error)
+
+
 def _fail(folder: records.RunFolder, reason: str) -> None:
-    try:
+    with suppress(OSError):  # where it can't be recorded, it is told all the same
         folder.write_status("failed", reason=reason)
-    except OSError:
-        print(f"styleexp: the failure could not be recorded in {folder.path}.", file=sys.stderr)
 
 
 def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resumed: bool) -> int:

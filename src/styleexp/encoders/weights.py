@@ -7,18 +7,16 @@ where the weights came from and a digest of the content: one atomic file is all 
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
-import os
 import re
-import tempfile
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from styleexp import atomic, digests
 
 FORMAT = "styleexp-vgg-1"
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -157,22 +155,10 @@ def write(path: str | Path, weights: VGGWeights, source: str, credit: str) -> No
         "format": FORMAT,
         "credit": credit,
         "normalisation": json.dumps(normalisation),
-        "digest": _digest(weights.tensors, json.dumps(normalisation)),
+        "digest": digests.of(weights.tensors, json.dumps(normalisation)),
     }
     data = save(weights.tensors, metadata)
-    path = Path(path)
-    # A name of its own for every writer: two processes never write into each other's file.
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    atomic.write(Path(path), lambda at: at.write_bytes(data))
 
 
 def read(path: str | Path) -> VGGWeights:
@@ -190,7 +176,7 @@ def read(path: str | Path) -> VGGWeights:
         metadata = _metadata(data)
         normalisation = json.loads(metadata["normalisation"])
         tensors = load(data)
-        whole = _digest(tensors, metadata["normalisation"]) == metadata["digest"]
+        whole = digests.of(tensors, metadata["normalisation"]) == metadata["digest"]
     except (SafetensorError, ValueError, KeyError, TypeError) as error:
         raise DamagedWeights(f"not readable ({type(error).__name__})") from error
     if metadata.get("format") != FORMAT:
@@ -205,11 +191,3 @@ def _metadata(data: bytes) -> dict[str, Any]:
     # safetensors reads metadata only from a named file; the layout is 8 bytes of length, then JSON.
     length = int.from_bytes(data[:8], "little")
     return json.loads(data[8 : 8 + length])["__metadata__"]
-
-
-def _digest(tensors: Mapping[str, np.ndarray], extra: str) -> str:
-    digest = hashlib.sha256(extra.encode())
-    for name in sorted(tensors):
-        digest.update(f"{name}{tensors[name].shape}".encode())
-        digest.update(np.ascontiguousarray(tensors[name]).data)
-    return digest.hexdigest()

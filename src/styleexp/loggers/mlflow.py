@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock
 
+from styleexp import atomic
 from styleexp.errors import UserError
 
 # Read when MLflow is imported: it would send usage data.
@@ -61,7 +62,7 @@ class MLflow:
                 f"MLflow's store '{uri}' can't be used ({told}): give another one with "
                 "logger.mlflow.uri=URI."
             ) from error
-        kept.write_text(json.dumps({"uri": uri, "run_id": self._run}) + "\n", encoding="utf-8")
+        atomic.write(kept, atomic.text(json.dumps({"uri": uri, "run_id": self._run}) + "\n"))
         self._told = self._last_step() if before else 0
         self._waiting: list[Metric] = []
         self._steps = 0

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import trimesh
 
+from styleexp import atomic
 from styleexp.errors import UserError
 from styleexp.meshes.mesh import Carrier, Mesh, vertex_normals
 from styleexp.meshes.obj import MAP, surface
@@ -78,18 +79,9 @@ def save_mesh(
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():  # the mesh comes last, when all it needs is there
-            _write_atomically(path.with_name(name), content)
+            atomic.write(path.with_name(name), lambda at, content=content: at.write_bytes(content))
     except OSError as error:
         raise UserError(f"'{path}' cannot be written ({error.strerror or error}).") from None
-
-
-def _write_atomically(path: Path, content: bytes) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(content)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _row_normals(carrier: Carrier, vertices: np.ndarray) -> np.ndarray:

@@ -20,6 +20,8 @@ from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
+from styleexp import atomic
+
 if TYPE_CHECKING:
     from PIL import Image
 
@@ -115,12 +117,8 @@ def views(folder: Path, row: int) -> list[Image.Image]:
 
 def save(path: Path, text: str) -> Path:
     """Write a page whole or not at all."""
-    from styleexp.records import RunFolder
-
     path.parent.mkdir(parents=True, exist_ok=True)
-    return RunFolder(path.parent).write(
-        path.name, lambda partial: partial.write_text(text, encoding="utf-8")
-    )
+    return atomic.write(path, atomic.text(text))
 
 
 def number(value: Any) -> str:

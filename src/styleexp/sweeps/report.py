@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra.experimental.callback import Callback
 
+from styleexp import locks
 from styleexp.records import RunFolder
 from styleexp.reports import runs
 from styleexp.sweeps.jobs import Job, product, readable, varying
@@ -26,6 +28,15 @@ begun: Path | None = None
 
 class OnSweep(Callback):
     """Hydra's callback: note the jobs at the start of a sweep, report at its end."""
+
+    def on_run_start(self, config: DictConfig, **rest: Any) -> None:
+        """Keep Hydra from writing its files into the folder of a run that is at work."""
+        from styleexp.cli.run import busy
+
+        folder = Path(config.hydra.run.dir)
+        if locks.held(folder):  # Hydra swallows all exceptions of callbacks but this
+            print(f"styleexp: {busy(folder)}", file=sys.stderr)
+            sys.exit(2)
 
     def on_multirun_start(self, config: DictConfig, **rest: Any) -> None:
         """Write ``jobs.json`` for sweeps whose jobs are known beforehand."""
