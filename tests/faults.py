@@ -179,6 +179,7 @@ class Life:
                 self.process: Any = subprocess.Popen(
                     [sys.executable, "-m", module, *arguments], cwd=stage.folder, env=environment,
                     stdout=told, stderr=complained, start_new_session=True,
+                    preexec_fn=functools.partial(_confine, **fault),
                 )  # fmt: skip
         else:
             self.process = context.Process(target=_live, args=given)
@@ -222,6 +223,11 @@ class Life:
         return found
 
 
+def _confine(memory: int | None = None) -> None:
+    if memory:
+        resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+
+
 def _text(path: Path) -> str:
     return path.read_text(errors="replace") if path.exists() else ""
 
@@ -245,11 +251,10 @@ def _live(
         os.close(handle)
     sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
     sys.argv = ["styleexp", *arguments]
-    if "memory" in fault:
-        resource.setrlimit(resource.RLIMIT_AS, (fault["memory"],) * 2)
+    _confine(fault.pop("memory", None))
     changes = [0]
-    if "watched" in fault:
-        _watch(changes, **{k: v for k, v in fault.items() if k != "memory"})
+    if fault:
+        _watch(changes, **fault)
     from styleexp.cli import main, sweep
 
     try:
@@ -421,7 +426,7 @@ def kill_sweep(
 
     def start() -> Life:
         return stage.start(
-            "plan.yaml", "--folder", str(folder), "--launcher", launcher, sweeping=True
+            "plan.yaml", "--folder", str(folder), "--launcher", launcher, sweeping=True, fresh=True
         )
 
     runner = start()
@@ -519,7 +524,7 @@ def full_disk_of_a_sweep(stage: Stage, chance: random.Random) -> str:
         done = stage.sweep(small / "sweep")
         assert done.code == 2
         assert "Traceback" not in done.complained + done.told, done.complained[-2000:]
-        said = [*done.complaint.splitlines(), *done.told.strip().splitlines()][0]
+        said = next(x for x in (done.complaint + done.told).splitlines() if "space" in x)
         remount(small, f"size={4 * needed}")
         again = stage.sweep(small / "sweep", "--retry")
         assert again.code == 0, again.complaint + again.told
@@ -617,7 +622,7 @@ def removed_sweep(stage: Stage, chance: random.Random) -> str:
         assert again.code == 0, again.complaint
     check_swept(folder, stage.swept)
     shutil.rmtree(folder)
-    return next((line for line in told.splitlines() if "failed" in line), "nothing")
+    return next((x for x in told.splitlines() if "removed" in x or "failed" in x), "nothing")
 
 
 def wait_for(path: Path, life: Life, seconds: float = 300) -> None:
@@ -686,7 +691,7 @@ def out_of_memory_in_a_worker(stage: Stage, chance: random.Random) -> str:
     (stage.folder / "greedy.yaml").write_text(plan)
     folder = stage.folder / "memory-sweep"
     arguments = ("greedy.yaml", "--folder", str(folder), "--launcher", "joblib")
-    done = stage.command(*arguments, sweeping=True, memory=limit)
+    done = stage.command(*arguments, sweeping=True, fresh=True, memory=limit)
     assert done.code == 2, done.complaint
     assert "Traceback" not in done.told + done.complained, done.complained[-2000:]
     states = {name: job["state"] for name, job in manifest.read(folder).items()}
@@ -914,7 +919,8 @@ def bad_download(stage: Stage, chance: random.Random, fault: str) -> str:
             told, complained = process.communicate(timeout=300)
         said = "nothing but the shell's 'Killed'; the next run fetches it again"
         if fault != "killed":
-            lines = [x for x in complained.splitlines() if not x.startswith("fetching")]
+            progress = ("fetching", "Downloading")
+            lines = [x for x in complained.splitlines() if not x.startswith(progress)]
             said = Done(process.returncode, told, "\n".join(lines)).sentence()
         assert not list(cache.glob("weights/[!.]*.safetensors"))
         if fault == "full":

@@ -81,7 +81,10 @@ def recorded(config: Any) -> schema.Config:
         return typed(OmegaConf.create(config))
     except (OmegaConfBaseException, AssertionError, AttributeError, TypeError, ValueError) as error:
         told = (str(error).splitlines() or [type(error).__name__])[0]
-        raise UserError(f"the run's record is no configuration of this version: {told}") from error
+        raise UserError(
+            f"the run's record is no configuration of this version ({told}): use the version of "
+            "styleexp that wrote it."
+        ) from error
 
 
 def _part(kind: str, plain: dict[str, Any] | None) -> Any:

@@ -20,12 +20,10 @@ from typing import TYPE_CHECKING, Any
 
 from styleexp import atomic, digests, plugins
 from styleexp.errors import UserError
+from styleexp.layout import SCHEMA, too_new
 
 if TYPE_CHECKING:
     from styleexp.stylize import State, Step
-
-SCHEMA = 1
-"""Version of the run folder's layout."""
 
 FILES = (
     "status.json",
@@ -90,11 +88,17 @@ class RunFolder:
 
     def unfinished(self, record: Mapping[str, Any]) -> dict[str, Any] | None:
         """The record of this folder's run if it is the same as ``record``'s and not done."""
+        path = self.path / "run.json"
         try:
-            before = read_record(self.path)
+            before = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return None
+        if told := too_new(before):  # it must not be written over
+            raise UserError(f"cannot run in '{self.path}': {told}")
+        try:
             status = json.loads((self.path / "status.json").read_text(encoding="utf-8"))
             same = status["status"] != "done" and _same(before, record)
-        except (UserError, OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return None
         return before if same else None
 
@@ -242,6 +246,14 @@ def _versions() -> dict[str, str | None]:
     return found
 
 
+def changed_versions(record: Mapping[str, Any]) -> str:
+    """Packages that a run was begun with in another version than this one's, or nothing."""
+    here = {"python": platform.python_version(), **_versions()}
+    then = record.get("versions") or {}
+    changed = [(name, old) for name, old in then.items() if name in here and old != here[name]]
+    return ", ".join(f"{name} {old} (now {here[name]})" for name, old in changed)
+
+
 def now() -> str:
     """The time, UTC, ISO 8601."""
     return datetime.now(UTC).isoformat(timespec="seconds")
@@ -256,11 +268,10 @@ def read_record(folder: Path, purpose: str = "resume") -> dict[str, Any]:
         )
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
-        if record["schema"] != SCHEMA:
-            raise UserError(
-                f"'{path}' has layout {record['schema']}, this version reads {SCHEMA}: "
-                "use the version of styleexp that wrote it."
-            )
-    except (ValueError, KeyError, TypeError) as error:
+        if told := too_new(record):
+            raise UserError(f"cannot {purpose} '{folder}': {told}")
+        if not isinstance(record, dict):
+            raise ValueError("it holds no object")
+    except ValueError as error:
         raise UserError(f"'{path}' cannot be read ({error}): start the run anew.") from error
     return record

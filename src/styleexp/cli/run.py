@@ -59,6 +59,8 @@ def resume(folder: Path) -> int:
 
     record = records.read_record(folder)
     config = compose.recorded(record.get("config"))
+    if changed := records.changed_versions(record):
+        print(f"note: the run was begun with {changed}: what follows may differ in its digits")
     with _alone(folder):
         return _guarded(config, records.RunFolder(folder), record, resumed=True)
 

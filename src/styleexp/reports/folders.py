@@ -10,6 +10,7 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from styleexp import locks
+from styleexp.layout import too_new
 
 MARKS = ("run.json", "status.json", ".hydra/overrides.yaml")
 """Files that tell a run's folder; Hydra's is there before the run has a record."""
@@ -34,7 +35,8 @@ class Run:
     @property
     def state(self) -> str:
         """``done``, ``running``, ``interrupted``, ``failed``; ``missing`` if it never began,
-        ``died`` if it calls itself running and no process is at it."""
+        ``died`` if it calls itself running and no process is at it, ``newer`` if a later version of
+        styleexp wrote it."""
         return str(self.status.get("status", "missing"))
 
     @property
@@ -104,6 +106,9 @@ def read(folder: Path) -> Run:
         return content
 
     record, status, measured = load("run.json"), load("status.json"), load("metrics.json")
+    if told := too_new(record) or too_new(status):
+        problems.append(f"This run can't be read: {told}")
+        return Run(folder, {}, {"status": "newer"}, problems=tuple(problems))
     if status.get("status") == "running" and not locks.held(folder):
         status["status"] = "died"
     metrics = {
@@ -194,6 +199,10 @@ def _composed(folder: Path) -> list[str]:
     if not path.is_file():
         return []
     from omegaconf import OmegaConf
+    from yaml import YAMLError
 
-    found = OmegaConf.to_container(OmegaConf.load(path))
+    try:
+        found = OmegaConf.to_container(OmegaConf.load(path))
+    except (OSError, YAMLError):  # Hydra was killed while it wrote
+        return []
     return [str(each) for each in found] if isinstance(found, list) else []

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from styleexp import locks
+from styleexp.layout import too_new
 
 FINAL_SHARE = 10
 """The final loss is the mean over the last tenth of the steps."""
@@ -18,7 +19,8 @@ def read(folder: Path) -> dict[str, Any]:
     ``config.*``, ``version.*``, ``device``, ``asset.*`` (sha256, or the name of what has no file).
 
     ``status`` is the run's own (see ``RunFolder.write_status``), ``missing`` where there is none,
-    ``died`` where a run calls itself running but no process is at it. Nothing raises: what can't be
+    ``died`` where a run calls itself running but no process is at it, ``newer`` where a later
+    version of styleexp wrote it. Nothing raises: what can't be
     read is left out, and ``reason`` says so.
     """
     faults: list[str] = []
@@ -31,6 +33,8 @@ def read(folder: Path) -> dict[str, Any]:
         "device": record.get("device"),
         "loss": _final_loss(folder / "metrics.jsonl"),
     }
+    if newer := too_new(record) or too_new(told):
+        return {**row, "status": "newer", "reason": newer}
     if row["status"] == "running" and not locks.held(folder):
         row["status"] = "died"
     row["reason"] = "; ".join([*filter(None, [told.get("reason")]), *faults]) or None

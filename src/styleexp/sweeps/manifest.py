@@ -33,12 +33,15 @@ def write(folder: Path, jobs: Iterable[Planned]) -> None:
         before = read(folder)
         listed = {}
         for job in jobs:
+            found = runs.read(job.folder)
+            if found["status"] == "newer":
+                raise UserError(f"cannot run in '{job.folder}': {found['reason']}")
             known = before.pop(job.name, {})
             listed[job.name] = {
                 "key": job.key,
                 "experiment": job.entry,
                 "overrides": list(job.overrides),
-                "state": runs.read(job.folder)["status"],
+                "state": found["status"],
                 "attempts": known.get("attempts", 0),
             } | {k: known[k] for k in ("host", "process", "changed") if k in known}
         for name, known in before.items():

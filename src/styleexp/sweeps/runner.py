@@ -42,9 +42,11 @@ def run(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> None:
     deaths: Counter[str] = Counter()
     suspects: set[str] = set()
     while True:
+        if not (folder / manifest.NAME).exists():  # the folder was removed under us
+            manifest.write(folder, jobs)
         states = {job.name: runs.read(job.folder)["status"] for job in jobs}
         for job in jobs:
-            if states[job.name] == "died" and deaths[job.name] >= MOST_DEATHS:
+            if states[job.name] not in manifest.ENDED and deaths[job.name] >= MOST_DEATHS:
                 _give_up(job, folder)
                 states[job.name] = "failed"
         waiting = [job for job in jobs if states[job.name] not in (*manifest.ENDED, "running")]
@@ -57,7 +59,11 @@ def run(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> None:
         batch = [job for job in waiting if job.name not in suspects] or waiting[:1]
         before = _progress(folder, batch)
         error = _launch(batch, folder, launcher)
-        died = [job.name for job in batch if runs.read(job.folder)["status"] == "died"]
+        after = {job.name: runs.read(job.folder)["status"] for job in batch}
+        died = [name for name, state in after.items() if state == "died"]
+        if error is not None and not set(after.values()) & set(manifest.ENDED):
+            # Nothing came of it: some job can't even leave a status, as in a folder without space.
+            died = [name for name, state in after.items() if state != "running"]
         if len(batch) == 1:
             deaths.update(died)
         suspects.update(died)
@@ -83,7 +89,7 @@ def retry(jobs: Sequence[Planned]) -> None:
 
 def _give_up(job: Planned, folder: Path) -> None:
     reason = f"its process died {MOST_DEATHS} times without finishing: see {LOG}"
-    with locks.hold(job.folder, manifest.PATIENCE):
+    with suppress(OSError), locks.hold(job.folder, manifest.PATIENCE):
         records.RunFolder(job.folder).write_status("failed", reason=reason)
     manifest.update(folder, job.name, "failed")
     print(f"{job.name}: failed: {reason}")
