@@ -21,7 +21,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -108,6 +108,12 @@ class Stage:
         if (folder / "run.json").exists():
             return self.command(f"resume={folder}", **options)
         return self.run(folder, **options)
+
+    def tidy(self) -> None:
+        """Remove what a trial that failed left."""
+        for path in self.folder.iterdir():
+            if path.is_dir() and path.name not in ("cache", "undisturbed", "undisturbed-sweep"):
+                shutil.rmtree(path, ignore_errors=True)
 
     @property
     def whole(self) -> Path:
@@ -919,9 +925,8 @@ def bad_download(stage: Stage, chance: random.Random, fault: str) -> str:
             told, complained = process.communicate(timeout=300)
         said = "nothing but the shell's 'Killed'; the next run fetches it again"
         if fault != "killed":
-            progress = ("fetching", "Downloading")
-            lines = [x for x in complained.splitlines() if not x.startswith(progress)]
-            said = Done(process.returncode, told, "\n".join(lines)).sentence()
+            assert "Traceback" not in complained, complained
+            said = Done(process.returncode, told, complained.splitlines()[-1]).sentence()
         assert not list(cache.glob("weights/[!.]*.safetensors"))
         if fault == "full":
             remount(cache, "size=64m")
@@ -932,3 +937,52 @@ def bad_download(stage: Stage, chance: random.Random, fault: str) -> str:
         assert len(weights.read(told.strip()).tensors) == 32
     shutil.rmtree(cache, ignore_errors=True)
     return re.sub(r"127\.0\.0\.1:\d+", "127.0.0.1", said).replace(str(stage.folder), "…")
+
+
+# ----------------------------------------------------------------------------------------- the list
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A row of the table in docs/robustness.md."""
+
+    name: str
+    trial: Callable[..., Any]
+    """Takes the stage and a source of chance; returns what the user saw, or how many processes were
+    killed and that."""
+    times: int
+    given: Mapping[str, Any] = field(default_factory=dict)
+
+    def tried(self, stage: Stage, chance: random.Random, **more: Any) -> tuple[int, str]:
+        """How often it was tried, which is once but for kills, and what the user saw."""
+        found = self.trial(stage, chance, **self.given, **more)
+        count, said = found if isinstance(found, tuple) else (1, found)
+        return count, said.replace(f"{stage.folder}/", "")
+
+
+FAULTS = {
+    each.name: each
+    for each in (
+        Fault("kill -9 of a run, at any moment of its life", kill_run, 25, {"how": "time"}),
+        Fault("kill -9 of a run, as it changes its folder", kill_run, 25, {"how": "change"}),
+        Fault("kill -9 of a sweep's runner or worker", kill_sweep, 20),
+        Fault("disk full under a run", full_disk, 10),
+        Fault("disk full under a sweep", full_disk_of_a_sweep, 5),
+        Fault("folder made read-only under a run", read_only, 3),
+        Fault("read-only disk: the run's, the cache's", read_only_disk, 3),
+        Fault("folder removed under a run", removed_folder, 5),
+        Fault("folder of a job, or of all, removed under a sweep", removed_sweep, 5),
+        Fault("clock jumps by up to 40 years, with a kill -9", clock_jumps, 3),
+        Fault("not enough memory for a run", out_of_memory, 3),
+        Fault("not enough memory for a job of a sweep", out_of_memory_in_a_worker, 3),
+        Fault("damaged checkpoint, or both, or metrics.jsonl", damaged_checkpoint, 20),
+        Fault("damaged run.json or status.json", damaged_record, 10),
+        Fault("damaged manifest.json", damaged_sweep, 5),
+        Fault("damaged cache of Gram matrices", damaged_cache, 10),
+        Fault("a second run, and a resume, in a run's folder", two_runs, 3),
+        Fault("download cut in the middle", bad_download, 3, {"fault": "cut"}),
+        Fault("download with a wrong byte", bad_download, 3, {"fault": "wrong"}),
+        Fault("kill -9 in the middle of a download", bad_download, 5, {"fault": "killed"}),
+        Fault("disk full in the middle of a download", bad_download, 3, {"fault": "full"}),
+    )
+}

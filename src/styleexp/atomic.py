@@ -44,6 +44,11 @@ def text(content: str) -> Callable[[Path], Any]:
     return lambda path: path.write_text(content, encoding="utf-8")
 
 
+def data(content: bytes) -> Callable[[Path], Any]:
+    """A writer of bytes, for `write`."""
+    return lambda path: path.write_bytes(content)
+
+
 def sweep(folder: Path, seconds: float = 0.0) -> None:
     """Remove what writers that were killed left in ``folder``, if it is older than ``seconds``.
 

@@ -195,7 +195,7 @@ def write(maps: Maps, folder: Path, kind: str) -> dict[str, Any]:
             normal: png(_sixteen(encoded)),
         }
         for path, content in files.items():
-            atomic.write(path, lambda at, content=content: at.write_bytes(content))
+            atomic.write(path, atomic.data(content))
     else:
         scale, level = 1.0, 0.0
         atomic.write(height, lambda at: _write_exr(at, {"Y": maps.height}))

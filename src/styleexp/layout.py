@@ -10,8 +10,7 @@ them. Folders of a later version are refused: see `too_new`."""
 
 
 def too_new(content: Any) -> str | None:
-    """Why a run's folder can't be used, where a later version of styleexp wrote this ``run.json`` or
-    ``status.json``."""
+    """Why a run's folder can't be used, where a later version of styleexp wrote this JSON file."""
     layout = content.get("schema", 1) if isinstance(content, dict) else 1
     if isinstance(layout, int) and layout <= SCHEMA:
         return None

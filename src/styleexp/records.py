@@ -140,7 +140,7 @@ class RunFolder:
         self._sync_metrics()
         if self.checkpoint.exists():
             os.replace(self.checkpoint, self.path / "checkpoint.previous.safetensors")
-        self.write("checkpoint.safetensors", lambda path: path.write_bytes(content))
+        self.write("checkpoint.safetensors", atomic.data(content))
 
     def _sync_metrics(self) -> None:
         """A checkpoint on the disk means that the lines of its steps are there, too."""

@@ -103,7 +103,7 @@ def _write(path: Path, found: tuple[Grams, Grams]) -> None:
     with suppress(OSError):  # a run needs no cache
         path.parent.mkdir(parents=True, exist_ok=True)
         atomic.sweep(path.parent, seconds=atomic.A_DAY)
-        atomic.write(path, lambda at: at.write_bytes(content))
+        atomic.write(path, atomic.data(content))
         files = sorted(path.parent.glob("[!.]*.safetensors"), key=lambda p: p.stat().st_mtime)
         for old in files[:-KEPT]:
             old.unlink(missing_ok=True)

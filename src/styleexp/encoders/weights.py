@@ -158,7 +158,7 @@ def write(path: str | Path, weights: VGGWeights, source: str, credit: str) -> No
         "digest": digests.of(weights.tensors, json.dumps(normalisation)),
     }
     data = save(weights.tensors, metadata)
-    atomic.write(Path(path), lambda at: at.write_bytes(data))
+    atomic.write(Path(path), atomic.data(data))
 
 
 def read(path: str | Path) -> VGGWeights:

@@ -79,7 +79,7 @@ def save_mesh(
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():  # the mesh comes last, when all it needs is there
-            atomic.write(path.with_name(name), lambda at, content=content: at.write_bytes(content))
+            atomic.write(path.with_name(name), atomic.data(content))
     except OSError as error:
         raise UserError(f"'{path}' cannot be written ({error.strerror or error}).") from None
 
