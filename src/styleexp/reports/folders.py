@@ -10,6 +10,7 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from styleexp import locks
+from styleexp.errors import UserError
 from styleexp.layout import too_new
 
 MARKS = ("run.json", "status.json", ".hydra/overrides.yaml")
@@ -107,8 +108,7 @@ def read(folder: Path) -> Run:
 
     record, status, measured = load("run.json"), load("status.json"), load("metrics.json")
     if told := too_new(record) or too_new(status):
-        problems.append(f"This run can't be read: {told}")
-        return Run(folder, {}, {"status": "newer"}, problems=tuple(problems))
+        return Run(folder, status={"status": "newer", "reason": told}, problems=(told,))
     if status.get("status") == "running" and not locks.held(folder):
         status["status"] = "died"
     metrics = {
@@ -126,6 +126,14 @@ def read(folder: Path) -> Run:
         _composed(folder) if overrides is None else list(overrides),
         tuple(problems),
     )
+
+
+def readable(folder: Path, purpose: str) -> Run:
+    """The same; a `UserError` for a run that a later version of styleexp wrote."""
+    run = read(folder)
+    if run.state == "newer":
+        raise UserError(f"cannot {purpose} '{folder}': {run.status['reason']}")
+    return run
 
 
 def is_run(folder: Path) -> bool:

@@ -62,7 +62,7 @@ def write_ended(folder: Path, result: Result, seconds: float) -> Path:
 
 def rewrite(folder: Path) -> Path:
     """The page of a run, finished or not, from what its folder holds."""
-    run = folders.read(folder)
+    run = folders.readable(folder, "show")
     return write(run, shows.read(run))
 
 

@@ -131,7 +131,7 @@ def read_moved(folder: Path) -> tuple[meshes.Mesh, np.ndarray, np.ndarray]:
     from styleexp.meshes.writing import ply_rows
     from styleexp.reports import folders
 
-    run, missing = folders.read(folder), list[str]()
+    run, missing = folders.readable(folder, "use"), list[str]()
     path = folder / "result.ply"
     if not path.is_file():
         raise UserError(f"'{folder}' has no result.ply: give the folder of a finished run.")
