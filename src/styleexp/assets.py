@@ -30,6 +30,7 @@ import tempfile
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -315,7 +316,8 @@ def _converted(asset: Asset, quiet: bool = False) -> Path | None:
         if not path.is_file():
             continue
         try:
-            source = weights.read(path).source
+            known = path.stat()
+            source = _source(path, known.st_mtime_ns, known.st_size, known.st_ino)
         except (weights.DamagedWeights, OSError) as error:
             fault = f"is damaged: {error}"
         else:
@@ -325,6 +327,15 @@ def _converted(asset: Asset, quiet: bool = False) -> Path | None:
         if not quiet:
             log.warning("%s %s; it is not used.", path, fault)
     return None
+
+
+@lru_cache(maxsize=16)
+def _source(path: Path, *version: int) -> str:
+    """What a converted file was made from, once it was read and verified; ``version`` tells whether
+    it is still the same file. Who uses it verifies it again."""
+    from styleexp.encoders import weights
+
+    return weights.read(path).source
 
 
 def _published(asset: Asset) -> Path | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import re
 import signal
 import sys
 import time
@@ -147,14 +148,17 @@ def _guarded(
         folder.write_status("interrupted", reason="stopped by the user")
         raise
     except Exception as error:
-        _fail(folder, str(error))
-        if _out_of_memory(error):
-            raise UserError(
-                f"there is not enough memory for this run ({records.first_line(error)}): take "
-                "fewer or smaller views (views.count, views.local.count, views.resolution), a mesh "
-                "with fewer faces, or fewer runs at once."
-            ) from error
-        raise
+        if not _out_of_memory(error):
+            _fail(folder, str(error))
+            raise
+        asked = re.search(r"allocate (\d+) bytes", str(error))
+        more = f" ({int(asked[1]) / 1e6:.0f} MB more could not be had)" if asked else ""
+        told = (
+            f"there is not enough memory for this run{more}: take fewer or smaller views "
+            "(views.count, views.resolution), a mesh with fewer faces, or fewer runs at once."
+        )
+        _fail(folder, told)
+        raise UserError(told) from error
 
 
 def _out_of_memory(error: BaseException) -> bool:
