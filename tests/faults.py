@@ -402,7 +402,7 @@ def kill_run(stage: Stage, chance: random.Random, how: str, most: int = 5) -> tu
         if not (folder / "run.json").exists():
             arguments = [*RUN, f"hydra.run.dir={folder}"]
         if how == "change":
-            at = chance.randint(1, stage.changes)
+            at = 1 + int(chance.random() * stage.changes)
             torn = chance.random() < 0.5
             life = stage.start(*arguments, watched=str(folder), dies_at=at, torn=torn)
             life.wait(900)
@@ -567,6 +567,27 @@ def read_only(stage: Stage, chance: random.Random) -> str:
     done = stage.resume(folder)
     assert done.code == 0, done.complained[-2000:]
     check_same(folder, stage.whole)
+    shutil.rmtree(folder)
+    return said
+
+
+def frozen_job(stage: Stage, chance: random.Random) -> str:
+    """The folder of one job of a sweep can't be written; the others are done."""
+    from styleexp.sweeps import manifest
+
+    folder = stage.folder / "frozen-sweep"
+    names = sorted(manifest.read(stage.swept))
+    lost = folder / chance.choice(names)
+    lost.mkdir(parents=True)
+    with frozen(lost):
+        done = stage.sweep(folder)
+        assert "Traceback" not in done.complained + done.told, done.complained[-2000:]
+        said = done.sentence()
+        for name in set(names) - {str(lost.relative_to(folder))}:
+            check_same(folder / name, stage.swept / name)
+    again = stage.sweep(folder, "--retry")
+    assert again.code == 0, again.complaint
+    check_swept(folder, stage.swept)
     shutil.rmtree(folder)
     return said
 
@@ -970,6 +991,7 @@ FAULTS = {
         Fault("disk full under a run", full_disk, 5),
         Fault("disk full under a sweep", full_disk_of_a_sweep, 3),
         Fault("folder made read-only under a run", read_only, 2),
+        Fault("folder of a job of a sweep can't be written", frozen_job, 2),
         Fault("read-only disk: the run's, the cache's", read_only_disk, 2),
         Fault("folder removed under a run", removed_folder, 3),
         Fault("folder of a job, or of all, removed under a sweep", removed_sweep, 3),

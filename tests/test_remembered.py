@@ -60,10 +60,13 @@ def test_what_matters_is_measured_anew(made, changed):
     assert measured == (1 if changed.startswith("style.scale") else 2)
 
 
-def test_a_damaged_file_is_measured_anew(made, tmp_path):
+@pytest.mark.parametrize("damage", ["cut", "bit"])
+def test_a_damaged_file_is_measured_anew(made, tmp_path, damage):
     first, _ = made()
     for file in (tmp_path / "cache" / "grams").glob("*.safetensors"):
-        file.write_bytes(file.read_bytes()[:1000])
+        content = bytearray(file.read_bytes())
+        content[-1] ^= 1
+        file.write_bytes(content[:1000] if damage == "cut" else bytes(content))
     second, measured = made()
     assert measured == 2
     assert all(map(torch.equal, grams(first), grams(second)))
