@@ -3,8 +3,13 @@
 # make lint   ruff and mypy
 # make docs   the documentation, to site/index.html; warnings are errors
 # make conformance   write docs/conformance.md from the checks of every renderer
-# make stress   kill runners and workers of sweeps ten times each, with every local launcher; random
-#               meshes, files, overrides and renders, STRESS_FUZZ times as many as in CI
+# make stress   all that takes long: kill runners and workers of sweeps ten times each, with every
+#               local launcher; random meshes, files, overrides and renders, STRESS_FUZZ times as many
+#               as in CI; every fault of benchmarks/faults.py; benchmarks/long_haul.py. Each of the
+#               last three gets STRESS_SECONDS. (make stress-sweeps stress-fuzz stress-faults
+#               stress-long: one of them)
+# make matrix   install and run as wheel, editable, with the oldest and the newest dependencies, on
+#               every Python that is here (noxfile.py)
 # make sbom   what .venv holds, as CycloneDX, in build/sbom.json (tools in .venv-security)
 # make audit  known weaknesses of what .venv holds (asks pypi.org)
 # make bench-guard   is this tree slower than a commit (BASE=...), at the same moment on this machine?
@@ -18,7 +23,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check \
 	$(if $(CONSTRAINTS),--constraint $(CONSTRAINTS)) $(PIP_FLAGS)
 
-# How many times as many random examples as in CI, and how many seconds they may take in all.
+# How many times as many random examples as in CI, and how many seconds each long part may take.
 STRESS_FUZZ ?= 50
 STRESS_SECONDS ?= 3600
 
@@ -27,7 +32,8 @@ export OMP_WAIT_POLICY ?= PASSIVE
 # Named meshes and images, where there are some beside the checkout.
 export STYLEEXP_ASSETS ?= $(wildcard $(abspath ../shared))
 
-.PHONY: demo test lint docs conformance stress sbom audit bench-guard ray-test clean
+.PHONY: demo test lint docs conformance stress stress-sweeps stress-fuzz stress-faults stress-long \
+	matrix sbom audit bench-guard ray-test clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -49,8 +55,18 @@ docs: $(VENV)/.installed-dev
 conformance: $(VENV)/.installed-dev
 	$(BIN)/python -m styleexp.testing > docs/conformance.md
 
-stress: $(VENV)/.installed-dev
+stress: stress-sweeps stress-fuzz stress-faults stress-long
+
+stress-sweeps: $(VENV)/.installed-dev
 	STYLEEXP_KILLS=10 OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/test_sweeps.py -k kill_9
+
+stress-faults: $(VENV)/.installed-dev
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/faults.py --seconds $(STRESS_SECONDS)
+
+stress-long: $(VENV)/.installed-dev
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/long_haul.py --seconds $(STRESS_SECONDS)
+
+stress-fuzz: $(VENV)/.installed-dev
 	STYLEEXP_FUZZ=$(STRESS_FUZZ) OMP_NUM_THREADS=1 timeout $(STRESS_SECONDS) \
 		$(BIN)/python -m pytest tests/test_fuzz.py
 
@@ -73,6 +89,15 @@ $(VENV)-security/.installed: Makefile
 bench-guard: $(VENV)/.installed-dev
 	$(BIN)/python benchmarks/guard.py $(BASE)
 
+matrix: $(VENV)-nox/.installed
+	PATH="$(abspath $(VENV)-nox/bin):$$PATH" nox
+
+$(VENV)-nox/.installed: Makefile
+	test -x $(VENV)-nox/bin/python || $(PYTHON) -m venv $(VENV)-nox
+	$(VENV)-nox/bin/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) \
+		'nox>=2025.2' 'uv>=0.8'
+	@touch $@
+
 # The Ray launcher pins cloudpickle below the tested version.
 ray-test: pyproject.toml constraints.txt
 	test -x $(VENV)-ray/bin/python || $(PYTHON) -m venv $(VENV)-ray
@@ -82,7 +107,7 @@ ray-test: pyproject.toml constraints.txt
 	OMP_NUM_THREADS=1 $(VENV)-ray/bin/python -m pytest tests/test_ray.py
 
 clean:
-	rm -rf $(VENV) $(VENV)-ray $(VENV)-security build dist src/*.egg-info
+	rm -rf $(VENV) $(VENV)-ray $(VENV)-security $(VENV)-nox .nox build dist src/*.egg-info
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

@@ -1,5 +1,5 @@
-"""Does it install and run: as a wheel, editable, with the core alone, with the oldest and the newest
-dependencies, on every Python that is here. Results: docs/compatibility.md.
+"""Does it install and run: as a wheel, editable, with the core alone, with the oldest and the
+newest dependencies, on every Python that is here. Results: docs/compatibility.md.
 
     pipx run nox -l                       # or: pip install nox; nox -l
     nox -s wheel-3.11                     # one session

@@ -3,6 +3,7 @@
     python benchmarks/long_haul.py                          # 500 runs, 2000 jobs
     python benchmarks/long_haul.py --runs 100 --jobs 0      # only the first, shorter
     python benchmarks/long_haul.py --runs 0 --jobs 2000 --launcher joblib
+    python benchmarks/long_haul.py --seconds 1800           # as many of both as there is time for
 
 Prints and writes into docs/robustness.md: memory and its slope after a warm-up (least squares),
 open files, threads, OpenGL contexts and temporary files at the beginning and at the end; of the
@@ -18,6 +19,7 @@ import csv
 import gc
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -125,14 +127,16 @@ def variants(folder: Path) -> Iterator[list[str]]:
         number += 1
 
 
-def many_runs(count: int, folder: Path, every: int = 5) -> list[Sample]:
-    """Run so many in this process, and look at it every few runs."""
+def many_runs(count: int, folder: Path, until: float, every: int = 5) -> list[Sample]:
+    """Run so many in this process, if there is time, and look at it every few runs."""
     from styleexp.cli.run import run
     from styleexp.compose import compose
 
     samples, given = [], variants(folder)
     with open(os.devnull, "w") as nowhere:
         for number in range(1, count + 1):
+            if time.perf_counter() > until and samples:
+                break
             overrides = next(given)
             with contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere):
                 code = run(compose(overrides), folder / "run", overrides)
@@ -172,8 +176,11 @@ def family(pid: int) -> list[int]:
     return found
 
 
-def many_jobs(jobs: int, launcher: str, folder: Path) -> tuple[dict[int, list[Sample]], dict]:
-    """Run the sweep; samples of the runner and of its workers by process, and what came out."""
+def many_jobs(
+    jobs: int, launcher: str, folder: Path, until: float
+) -> tuple[dict[int, list[Sample]], dict[str, Any]]:
+    """Run the sweep; samples of the runner and of its workers by process, and what came out. When
+    time is up it is stopped."""
     command = [sys.executable, "-m", "styleexp.cli.sweep", str(plan(jobs, folder))]
     command += ["--folder", str(folder / "sweep"), "--launcher", launcher]
     samples: dict[int, list[Sample]] = {}
@@ -182,6 +189,9 @@ def many_jobs(jobs: int, launcher: str, folder: Path) -> tuple[dict[int, list[Sa
         runner = subprocess.Popen(command, stdout=told, stderr=told)
         while runner.poll() is None:
             time.sleep(5)
+            if time.perf_counter() > until:
+                runner.send_signal(signal.SIGINT)
+                runner.wait()
             lines = (folder / "told.txt").read_text().splitlines()
             done = sum(": done in" in line for line in lines)
             if done and not planned:
@@ -192,9 +202,12 @@ def many_jobs(jobs: int, launcher: str, folder: Path) -> tuple[dict[int, list[Sa
                 with contextlib.suppress(OSError):
                     samples.setdefault(pid, []).append(Sample(done, *of_process(pid)))
     seconds = time.perf_counter() - begun
-    with open(folder / "sweep" / "many" / "table.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = []
+    if (table := folder / "sweep" / "many" / "table.csv").exists():
+        with open(table, newline="") as file:
+            rows = list(csv.DictReader(file))
     found = {
+        "reached": done,
         "code": runner.returncode, "rows": len(rows), "seconds": seconds, "planned": planned,
         "done": sum(row["status"] == "done" for row in rows), "report": seconds - last,
     }  # fmt: skip
@@ -236,8 +249,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=500)
     parser.add_argument("--jobs", type=int, default=2000)
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="for both together")
     parser.add_argument("--launcher", default="basic", choices=["basic", "joblib"])
     options = parser.parse_args()
+    started = time.perf_counter()
     folder, wrong = Path(tempfile.mkdtemp(prefix="styleexp-haul-")), False
     from styleexp import assets
 
@@ -251,28 +266,32 @@ def main() -> int:
         prepare(folder)
         if options.runs:
             begun, used = time.perf_counter(), time.process_time()
-            samples = many_runs(options.runs, folder)
+            samples = many_runs(options.runs, folder, started + options.seconds / 2)
             seconds = time.perf_counter() - begun
-            text = f"{options.runs} runs with {', '.join(renderers())} in {seconds / 60:.0f} min "
-            text += f"({time.process_time() - used:.0f} s of CPU):\n\n"
+            text = f"{samples[-1].at:.0f} runs with {', '.join(renderers())} in {seconds / 60:.0f} "
+            text += f"min ({time.process_time() - used:.0f} s of CPU):\n\n"
             write("runs", text + HEAD + row("the process", "run", samples))
             first, last = samples[int(WARM_UP * len(samples))], samples[-1]
             wrong |= last.files > first.files or last.contexts > first.contexts
             wrong |= last.temporary > first.temporary
         if options.jobs:
-            processes, found = many_jobs(options.jobs, options.launcher, folder)
-            text = (
-                f"A sweep of {options.jobs} jobs, launcher {options.launcher}: exit code "
-                f"{found['code']}, {found['rows']} rows in its table, {found['done']} of them "
-                f"done; {found['seconds'] / 60:.0f} min in all, {found['planned']:.0f} s before "
-                f"the first job was done, {found['report']:.0f} s from the last job to the end "
-                "(table and figure):\n\n"
-            )
+            until = started + options.seconds
+            processes, found = many_jobs(options.jobs, options.launcher, folder, until)
+            ended = time.perf_counter() < until
+            text = f"A sweep of {options.jobs} jobs, launcher {options.launcher}: "
+            text += f"{found['seconds'] / 60:.0f} min in all, {found['planned']:.0f} s before the "
+            text += "first job was done; "
+            if ended:
+                text += f"exit code {found['code']}, {found['rows']} rows in its table, "
+                text += f"{found['done']} of them done, {found['report']:.0f} s from the last job "
+                text += "to the end (table and figure):\n\n"
+                wrong |= found["code"] != 0 or found["done"] != options.jobs
+            else:
+                text += f"stopped after {found['reached']} jobs, as time was up:\n\n"
             long = [each for each in processes.values() if len(each) >= 20]
             names = ["the runner", *(f"worker {n}" for n in range(1, len(long)))][: len(long)]
             lines = [row(n, "job", s) for n, s in zip(names, long, strict=True)]
             write("jobs", text + HEAD + "".join(lines))
-            wrong |= found["code"] != 0 or found["done"] != options.jobs
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     return int(wrong)
