@@ -6,7 +6,8 @@ newest dependencies, on every Python that is here. Results: docs/compatibility.m
     nox                                   # all, on every Python that is found
 
 Each session makes an environment of its own, which is removed at its end (KEEP=1 keeps it), and
-takes 1 to 7 GB of disk meanwhile. ``CONSTRAINTS`` is pip's file of tested versions.
+takes 1 to 7 GB of disk meanwhile. ``CONSTRAINTS`` is the file of tested versions; ``TORCH`` a version
+to take in ``lowest`` and ``newest``, where the index has a CPU build of that one alone.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import nox
 ROOT = Path(__file__).parent
 PYTHONS = ["3.11", "3.12", "3.13", "3.14"]
 CONSTRAINTS = os.environ.get("CONSTRAINTS", str(ROOT / "constraints.txt"))
+TORCH = os.environ.get("TORCH", "")
 QUICK = ("tests/test_fields.py", "tests/test_losses.py", "tests/test_shapes.py",
          "tests/test_stylize.py", "tests/test_old_runs.py")  # fmt: skip
 """Tests that need nothing but the core, and take a minute."""
@@ -76,7 +78,9 @@ def lowest(session: nox.Session) -> None:
     """The oldest versions that pyproject.toml allows."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     bounds = [each.replace(">=", "==").split(",")[0] for each in project["dependencies"]]
-    session.install(*bounds, *session.posargs)
+    if TORCH:
+        bounds = [f"torch=={TORCH}" if each.startswith("torch==") else each for each in bounds]
+    session.install(*bounds)
     session.install("--no-deps", str(ROOT))
     check(session)
     end(session)
@@ -85,7 +89,7 @@ def lowest(session: nox.Session) -> None:
 @nox.session(python=PYTHONS)
 def newest(session: nox.Session) -> None:
     """The newest versions that pyproject.toml allows."""
-    session.install("--upgrade", str(ROOT), *session.posargs)
+    session.install("--upgrade", str(ROOT), *([f"torch=={TORCH}"] if TORCH else []))
     check(session)
     end(session)
 

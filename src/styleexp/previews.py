@@ -155,7 +155,7 @@ def check_views(
     """
     if importlib.util.find_spec("pyrender") is None:
         raise UserError(
-            "preview=pyrender needs a package: pip install pyrender-maintained, or choose "
+            "preview=pyrender needs a package: pip install 'styleexp[gl]', or choose "
             "preview=builtin."
         )
     job = {
