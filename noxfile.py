@@ -6,8 +6,8 @@ newest dependencies, on every Python that is here. Results: docs/compatibility.m
     nox                                   # all, on every Python that is found
 
 Each session makes an environment of its own, which is removed at its end (KEEP=1 keeps it), and
-takes 1 to 7 GB of disk meanwhile. ``CONSTRAINTS`` is the file of tested versions; ``TORCH`` a version
-to take in ``lowest`` and ``newest``, where the index has a CPU build of that one alone.
+takes 1 to 7 GB of disk meanwhile. ``CONSTRAINTS`` is the file of tested versions; ``TORCH`` a
+version to take in ``lowest`` and ``newest``, where the index has a CPU build of that one alone.
 """
 
 from __future__ import annotations
