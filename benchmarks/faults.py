@@ -33,7 +33,7 @@ HEAD = "| fault | tried | survived | lost | what the user sees |\n" + "| --- " *
 
 def main() -> int:
     """Try the faults, write the table."""
-    from faults import FAULTS, Missing, Stage
+    from fault_trials import FAULTS, Missing, Stage
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", default="", help="faults with this in their name")
@@ -78,7 +78,7 @@ def main() -> int:
 
 def page(text: str, rows: dict[str, str]) -> str:
     """The page with these rows brought up to date."""
-    from faults import FAULTS
+    from fault_trials import FAULTS
 
     start, end = text.index(BEGIN) + len(BEGIN), text.index(END)
     old = {line.split(" | ")[0].removeprefix("| "): line for line in text[start:end].splitlines()}

@@ -1,11 +1,11 @@
-"""Some of the faults of faults.py; `make stress` and benchmarks/faults.py try them all."""
+"""Some of the trials of fault_trials.py; `make stress` and benchmarks/faults.py try them all."""
 
 import os
 import random
 import time
 
 import pytest
-from faults import FAULTS, Missing, Stage, kill_run
+from fault_trials import FAULTS, Missing, Stage, kill_run
 
 from styleexp import atomic, records
 

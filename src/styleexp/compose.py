@@ -76,7 +76,6 @@ def recorded(config: Any) -> schema.Config:
 
     if "${" in json.dumps(config, default=str):
         raise UserError("the run's record holds an interpolation (${...}), not values alone.")
-    register()
     try:
         return typed(OmegaConf.create(config))
     except (OmegaConfBaseException, AssertionError, AttributeError, TypeError, ValueError) as error:
