@@ -7,11 +7,15 @@ or a worker that is killed leaves a job that is resumed from its checkpoint.
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import threading
 import time
 import traceback
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout, suppress
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +33,8 @@ LOG = "log.txt"
 """In a job's folder: what it printed."""
 MOST_DEATHS = 3
 """A job whose process died so often, with no other job beside it, has failed."""
+AT_WORK = threading.Lock()
+"""Held by this process while it is at a job."""
 POLL = 1.0
 """Seconds between looks at jobs that other runners are at."""
 
@@ -161,16 +167,33 @@ def task(config: DictConfig) -> None:
 
     from styleexp import compose
 
+    _end_with_runner()
     runtime = HydraConfig.get()
     root, folder = Path(runtime.sweep.dir), Path(runtime.runtime.output_dir)
     name = str(runtime.sweep.subdir)
     compose.register()
     try:
-        with locks.hold(folder):
+        with AT_WORK, locks.hold(folder):
             if runs.status(folder) not in manifest.ENDED:
                 _work(config, root, folder, name, list(runtime.overrides.task))
     except locks.Busy:
         return
+
+
+@cache
+def _end_with_runner() -> None:
+    """End a worker of joblib after its job where its runner was killed: it would wait for ever."""
+    if not multiprocessing.current_process().name.startswith("Loky"):
+        return
+    runner = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == runner:
+            time.sleep(POLL)
+        with AT_WORK:
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _work(config: DictConfig, root: Path, folder: Path, name: str, overrides: list[str]) -> None:
