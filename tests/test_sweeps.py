@@ -468,3 +468,37 @@ def test_what_slurm_is_asked_for(tmp_path):
         assert f"#SBATCH {line}" in asked
     assert "submitit.core._submit" in asked
     assert {job["state"] for job in manifest.read(tmp_path / "out").values()} == {"missing"}
+
+
+IDLE = """\
+import os, sys, time
+from joblib import Parallel, delayed
+from styleexp.sweeps import runner
+
+def job(number):
+    runner._end_with_runner()
+    print(os.getpid(), flush=True)
+    time.sleep(0.2)
+
+if __name__ == "__main__":
+    Parallel(n_jobs=2)(delayed(job)(n) for n in range(2))
+    time.sleep(600)
+"""
+
+
+def test_workers_of_a_killed_runner_end(tmp_path):
+    """joblib's own wait for ever for the next job of a runner that is no more."""
+    pytest.importorskip("joblib", reason="needs the extra sweep")
+    (tmp_path / "idle.py").write_text(IDLE)
+    parent = subprocess.Popen(
+        [sys.executable, "idle.py"], cwd=tmp_path, stdout=subprocess.PIPE, text=True
+    )
+    workers = {int(parent.stdout.readline()) for _ in range(2)}
+    assert parent.pid not in workers
+    time.sleep(1)
+    parent.kill()
+    parent.wait()
+    until = time.monotonic() + 60
+    while any(os.path.exists(f"/proc/{pid}") for pid in workers):
+        assert time.monotonic() < until, "a worker outlives its runner"
+        time.sleep(0.2)
