@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from styleexp.cli.metrics import main as metrics_command
 from styleexp.cli.report import main as report_command
 from styleexp.cli.run import resume
 from styleexp.cli.sweep import main as sweep_command
+from styleexp.compose import compose, recorded
 from styleexp.errors import UserError
 from styleexp.layout import SCHEMA
 from styleexp.reports import folders, runs
@@ -148,3 +150,11 @@ def test_a_plan_does_not_touch_a_job_of_a_later_version(old, capsys, tmp_path):
     told = refused(capsys, sweep_command(["plan.yaml", "--folder", "out"]))
     assert job.name in told
     assert "reads layouts up to" in told
+
+
+def test_options_that_a_record_is_older_than_are_what_it_was_made_with():
+    config = recorded(OLD[LATER]["run.json"]["config"])
+    assert (config.field.start, config.field.unfold, config.shading.lights) == ("source", False, 1)
+    assert not config.optim.unit_gradient
+    now = asdict(compose(["source=sphere", "style=bubble"]))
+    assert asdict(recorded(now)) == now

@@ -66,6 +66,14 @@ def typed(config: DictConfig) -> schema.Config:
     return built
 
 
+UNNAMED: dict[str, dict[str, Any]] = {
+    "field": {"start": "source", "unfold": False},
+    "shading": {"lights": 1},
+    "optim": {"unit_gradient": False},
+}
+"""What a record was made with that doesn't name these options, as it is older than they are."""
+
+
 def recorded(config: Any) -> schema.Config:
     """The configuration of a run's record, which may come from anywhere: all of it is values.
 
@@ -76,6 +84,10 @@ def recorded(config: Any) -> schema.Config:
 
     if "${" in json.dumps(config, default=str):
         raise UserError("the run's record holds an interpolation (${...}), not values alone.")
+    if isinstance(config, dict):
+        for part, values in UNNAMED.items():
+            if isinstance(config.get(part), dict):
+                config = {**config, part: {**values, **config[part]}}
     try:
         return typed(OmegaConf.create(config))
     except (OmegaConfBaseException, AssertionError, AttributeError, TypeError, ValueError) as error:
