@@ -125,7 +125,8 @@ def configure(source: str | Path, style: str | Path, overrides: Sequence[str]) -
 
 
 def start(scene: Scene) -> State:
-    """The state before the first step: M = C."""
+    """The state before the first step: M is the source C, or with ``field.start=map`` C under the
+    style's height map, to which the field is added."""
     optim = scene.config.optim
     generator = step_generator(optim.seed, 0, stream=7)
     config, bound = scene.config.field, scene.bound
@@ -234,7 +235,8 @@ def learning_rate(optim: OptimConfig, step: int) -> float:
 def displace(
     scene: Scene, state: State, precision: torch.dtype | None = None
 ) -> Float[Tensor, " vertices"]:
-    """The displacement of every vertex, in radii of the normalised source."""
+    """The displacement d of every vertex, in radii of the normalised source: the field's, on top of
+    ``scene.base`` where there is one (``field.start``; the paper has none)."""
     config = scene.config.field
     if precision is None:
         precision = torch.bfloat16 if scene.loss.encoder.precision == "bf16" else torch.float32
