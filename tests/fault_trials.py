@@ -213,6 +213,16 @@ class Life:
             os.kill(self.pid, signal.SIGKILL)
         self.wait(60)
 
+    def stand_still(self) -> None:
+        """Stop it where it is, until `go_on`."""
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self.pid, signal.SIGSTOP)
+            time.sleep(0.05)  # all its threads
+
+    def go_on(self) -> None:
+        """Wake it."""
+        os.kill(self.pid, signal.SIGCONT)
+
     def end(self) -> None:
         """Kill it and all that it started."""
         with contextlib.suppress(ProcessLookupError, PermissionError):
@@ -553,15 +563,12 @@ def frozen(*paths: Path) -> Iterator[None]:
 def read_only(stage: Stage, chance: random.Random) -> str:
     """A run's folder becomes read-only under it, and writable again."""
     folder = stage.folder / "frozen"
-    life = stage.start(*RUN, f"hydra.run.dir={folder}")
-    try:
-        wait_for(folder / "metrics.jsonl", life)
+    with at_work(stage, folder) as life:
         with frozen(folder, folder / "metrics.jsonl"):
+            life.go_on()
             assert life.wait(600) is not None
             begun = stage.run(folder / "other").sentence()
             assert "hydra.run.dir" in begun
-    finally:
-        life.end()
     said = life.done().sentence()
     check_whole(folder, stage.whole)
     done = stage.resume(folder)
@@ -614,14 +621,10 @@ def read_only_disk(stage: Stage, chance: random.Random) -> str:
 def removed_folder(stage: Stage, chance: random.Random) -> str:
     """A run's folder is removed while it is at work; the same command starts it anew."""
     folder = stage.folder / "removed"
-    life = stage.start(*RUN, f"hydra.run.dir={folder}")
-    try:
-        wait_for(folder / "metrics.jsonl", life)
-        time.sleep(chance.uniform(0, 0.5))
-        shutil.rmtree(folder, ignore_errors=True)
+    with at_work(stage, folder, after=chance.uniform(0, 0.3)) as life:
+        shutil.rmtree(folder)
+        life.go_on()
         life.wait(600)
-    finally:
-        life.end()
     said = life.done().sentence()
     assert stage.run(folder).code == 0
     check_same(folder, stage.whole)
@@ -651,6 +654,33 @@ def removed_sweep(stage: Stage, chance: random.Random) -> str:
     shutil.rmtree(folder)
     notes = [x for x in told.splitlines() if "was removed" in x or "going on" in x]
     return notes[0] if notes else "nothing"
+
+
+@contextlib.contextmanager
+def at_work(
+    stage: Stage, folder: Path, name: str = "metrics.jsonl", after: float = 0.0
+) -> Iterator[Life]:
+    """The small run, made to stand still so many seconds after a file of its folder is there; tried
+    again where this machine was too busy to catch it before its end."""
+    for _ in range(20):
+        life = stage.start(*RUN, f"hydra.run.dir={folder}")
+        try:
+            wait_for(folder / name, life)
+            time.sleep(after)
+            life.stand_still()
+            if life.poll() is None and not ended(folder):
+                yield life
+                return
+        finally:
+            life.end()
+        shutil.rmtree(folder)
+        after /= 2
+    raise AssertionError("the run always ended before it could be made to stand still")
+
+
+def ended(folder: Path) -> bool:
+    """Whether a run's folder says so."""
+    return json.loads((folder / "status.json").read_text())["status"] != "running"
 
 
 def wait_for(path: Path, life: Life, seconds: float = 300) -> None:
@@ -838,17 +868,13 @@ def damaged_sweep(stage: Stage, chance: random.Random) -> str:
 def two_runs(stage: Stage, chance: random.Random) -> str:
     """A second run, with other settings, is sent to the folder of one that is at work."""
     folder = stage.folder / "shared"
-    life = stage.start(*RUN, f"hydra.run.dir={folder}")
-    try:
-        wait_for(folder / ("run.json" if chance.random() < 0.5 else "metrics.jsonl"), life)
-        os.kill(life.pid, signal.SIGSTOP)  # so that it is still there when the others have begun
+    name = "run.json" if chance.random() < 0.5 else "metrics.jsonl"
+    with at_work(stage, folder, name) as life:  # it is still there when the others have begun
         more = chance.choice([("optim.seed=7",), ()])
         said = stage.run(folder, *more, "optim.steps=30").sentence()
         assert stage.command(f"resume={folder}").sentence()
-        os.kill(life.pid, signal.SIGCONT)
+        life.go_on()
         life.wait(600)
-    finally:
-        life.end()
     assert life.poll() == 0, life.done().complained[-2000:]
     check_same(folder, stage.whole)
     overrides = (folder / ".hydra" / "overrides.yaml").read_text()
