@@ -6,8 +6,9 @@
     python benchmarks/long_haul.py --seconds 1800           # as many of both as there is time for
 
 Prints and writes into docs/robustness.md: memory and its slope after a warm-up (least squares),
-open files, threads, OpenGL contexts and temporary files at the beginning and at the end; of the
-sweep also its table's rows and the time that the report took. Exit code 1 if a run failed, a row is
+what of it the C library has given out (where that is glibc: the rest are holes between), open
+files, threads, OpenGL contexts and temporary files at the beginning and at the end; of the sweep
+also its table's rows and the time that the report took. Exit code 1 if a run failed, a row is
 missing, or files, contexts or temporary files are more than they were.
 """
 
@@ -16,6 +17,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import csv
+import ctypes
 import gc
 import os
 import shutil
@@ -56,6 +58,8 @@ class Sample:
     threads: int
     contexts: int = 0
     temporary: int = 0
+    used: float = float("nan")
+    """MB that the C library has given out and not got back; resident are its holes, too."""
 
 
 def of_process(pid: int) -> tuple[float, int, int]:
@@ -63,6 +67,26 @@ def of_process(pid: int) -> tuple[float, int, int]:
     at = Path(f"/proc/{pid}")
     pages = int((at / "statm").read_text().split()[1])
     return pages * PAGE_SIZE / 1e6, len(list((at / "fd").iterdir())), len(list(at.glob("task/*")))
+
+
+class _Arenas(ctypes.Structure):
+    """glibc's ``struct mallinfo2``."""
+
+    _fields_ = tuple(
+        (name, ctypes.c_size_t)
+        for name in ("arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks",
+                     "uordblks", "fordblks", "keepcost")
+    )  # fmt: skip
+
+
+def given_out() -> float:
+    """MB that this process has from the C library; NaN where that is not glibc 2.33 or newer."""
+    tell = getattr(ctypes.CDLL(None), "mallinfo2", None)
+    if tell is None:
+        return float("nan")
+    tell.restype = _Arenas
+    told = tell()
+    return float(told.uordblks + told.hblkhd) / 1e6
 
 
 def contexts() -> int:
@@ -145,7 +169,9 @@ def many_runs(count: int, folder: Path, until: float, every: int = 5) -> list[Sa
             if number % every == 0:
                 gc.collect()
                 left = len(list(Path(tempfile.gettempdir()).iterdir()))
-                samples.append(Sample(number, *of_process(os.getpid()), contexts(), left))
+                samples.append(
+                    Sample(number, *of_process(os.getpid()), contexts(), left, given_out())
+                )
             if number % 50 == 0:
                 print(f"{number} runs, {samples[-1].memory:.0f} MB", flush=True)
     return samples
@@ -225,13 +251,14 @@ def row(name: str, unit: str, samples: list[Sample]) -> str:
         f"{max(s.memory for s in samples):.0f}", f"{1000 * slope(samples):+.1f} kB a {unit}",
         f"{first.files} → {last.files}", f"{first.threads} → {last.threads}",
         f"{first.contexts} → {last.contexts}", f"{first.temporary} → {last.temporary}",
+        f"{first.used:.1f} → {last.used:.1f}".replace("nan → nan", ""),
     ]  # fmt: skip
     return "| " + " | ".join(cells) + " |\n"
 
 
 HEAD = (
     "| process | looked at | memory, MB | most | slope | open files | threads | OpenGL contexts "
-    "| temporary files |\n" + "| --- " * 9 + "|\n"
+    "| temporary files | given out, MB |\n" + "| --- " * 10 + "|\n"
 )
 
 

@@ -563,12 +563,11 @@ def frozen(*paths: Path) -> Iterator[None]:
 def read_only(stage: Stage, chance: random.Random) -> str:
     """A run's folder becomes read-only under it, and writable again."""
     folder = stage.folder / "frozen"
-    with at_work(stage, folder) as life:
-        with frozen(folder, folder / "metrics.jsonl"):
-            life.go_on()
-            assert life.wait(600) is not None
-            begun = stage.run(folder / "other").sentence()
-            assert "hydra.run.dir" in begun
+    with at_work(stage, folder) as life, frozen(folder, folder / "metrics.jsonl"):
+        life.go_on()
+        assert life.wait(600) is not None
+        begun = stage.run(folder / "other").sentence()
+        assert "hydra.run.dir" in begun
     said = life.done().sentence()
     check_whole(folder, stage.whole)
     done = stage.resume(folder)

@@ -15,7 +15,7 @@ from PIL import Image
 
 from styleexp import assets, config
 from styleexp.compose import compose
-from styleexp.sweeps import report
+from styleexp.sweeps import figure, report
 from styleexp.sweeps.figure import Shown, layout
 from styleexp.sweeps.jobs import Job, setting, varying
 from styleexp.sweeps.plan import experiment_jobs
@@ -195,3 +195,13 @@ def test_jobs_without_a_folder_are_drawn_as_missing(tmp_path):
     picture = Image.open(tmp_path / "figure.png")
     assert picture.width == 4 * 96
     assert min(picture.crop((2 * 96, 20, 4 * 96, 112)).tobytes()) < 128  # words
+
+
+def test_a_sheet_shows_no_more_jobs_than_a_browser_can_open(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(figure, "MOST", 2)
+    jobs = [Job(name, (*GIVEN, f"optim.seed={name}", "preview.resolution=96"), tmp_path / name)
+            for name in "0123"]  # fmt: skip
+    report.report(jobs, tmp_path, "four that never began")
+    assert Image.open(tmp_path / "figure.png").width == 4 * 96
+    assert "the first 2 of 4 jobs" in capsys.readouterr().out
+    assert len((tmp_path / "table.csv").read_text().splitlines()) == 1 + 4

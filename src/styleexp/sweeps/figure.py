@@ -21,6 +21,8 @@ COLUMNS = 6
 """Pictures in a line, at most, where settings would make it longer."""
 PAIRS = 2
 """Pairs of source and style in a line, where each has one result."""
+MOST = 240
+"""Jobs in a sheet: at 512 pixels a picture more would not open in a browser."""
 
 
 @dataclass(frozen=True)
@@ -111,12 +113,13 @@ def _results(shown: Sequence[Shown], jobs: Sequence[int]) -> list[Cell]:
 
 
 def write_figure(jobs: Sequence[Job], folder: RunFolder) -> None:
-    """Draw ``figure.png``; a job without a result has its status in the picture's place."""
+    """Draw ``figure.png`` of the first `MOST` jobs; one without a result has its status in the
+    picture's place."""
     told = varying([job.overrides for job in jobs])
-    configs = [_config(job) for job in jobs]
+    configs = [_config(job) for job in jobs[:MOST]]
     shown = [
         Shown(_name(config.source), _name(config.style), setting(overrides))
-        for config, overrides in zip(configs, told, strict=True)
+        for config, overrides in zip(configs, told[:MOST], strict=True)
     ]
     if not jobs:
         return

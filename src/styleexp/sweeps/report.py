@@ -91,7 +91,7 @@ def report(jobs: Sequence[Job], folder: Path, title: str) -> None:
 
     The figure is drawn anew only where the table has changed.
     """
-    from styleexp.sweeps.figure import write_figure
+    from styleexp.sweeps.figure import MOST, write_figure
 
     rows = table(jobs)
     before = _content(folder / "table.csv")
@@ -100,6 +100,8 @@ def report(jobs: Sequence[Job], folder: Path, title: str) -> None:
         write_figure(jobs, RunFolder(folder))
     show(rows, title)
     _print(f"{folder / 'figure.png'}, {folder / 'table.csv'}")
+    if len(jobs) > MOST:
+        _print(f"figure.png shows the first {MOST} of {len(jobs)} jobs, the table all of them.")
 
 
 def _content(path: Path) -> bytes | None:
