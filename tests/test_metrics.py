@@ -1,14 +1,17 @@
 """The metrics on cases with a known answer. The whole truth board is in docs/metrics.md."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from styleexp import meshes, metrics, shapes
 from styleexp.cli.metrics import main
 from styleexp.compose import compose
+from styleexp.config import StyleConfig
 from styleexp.metrics import patches, shape, style, truth
 from styleexp.metrics.board import nearest
 from styleexp.scene import pattern_unit
@@ -113,7 +116,21 @@ def test_a_picture_is_judged_as_a_photograph_of_the_relief(judge):
     distances = [style.style_distance(x, goal, judge.plain) for x in (near, other, judge.plain)]
     assert distances[0] < distances[1]
     assert distances[2] == pytest.approx(1.0)
-    assert style.relief_distance(near, goal) is None
+
+
+def test_a_pictures_brightness_stands_for_a_relief_of_any_height(judge):
+    reliefs = [patches.relief_of_mesh(shapes.make(name, 20_000)) for name in ("bubble", "stripe")]
+    seen = patches.windows(reliefs[0], 1.0, 4).height[0].numpy()
+    bright = (seen - seen.min()) / (seen.max() - seen.min())
+    picture = np.repeat(bright[..., None], 3, axis=2).astype(np.float32)
+    goal = style.judged_picture(picture, StyleConfig(), 1.0, judge.encoder)
+    low = replace(reliefs[0], height=0.3 * reliefs[0].height)
+    near, other, lower = (
+        style.relief_distance(style.judged(each, 1.0, judge.encoder, 12), goal)
+        for each in (*reliefs, low)
+    )
+    assert near < 0.5 * other
+    assert lower == pytest.approx(near, rel=0.02)
 
 
 def test_windows_lie_flat_on_a_curved_surface():
@@ -312,3 +329,20 @@ def test_a_run_measured_from_its_file_is_as_it_was_measured_when_it_ended(board,
     again = json.loads(capsys.readouterr().out)
     logged = json.loads((board / "stripe" / "metrics.json").read_text())
     assert {k: logged[k] for k in again} == pytest.approx(again, rel=0.01, abs=1e-4)
+
+
+def test_the_pictures_truth_board_counts_every_case(monkeypatch, capsys, tmp_path):
+    rows, columns = np.sin(np.mgrid[0:64, 0:64] / 2)
+    dots = 2 * (rows * columns).clip(0) ** 3 - 1
+    for name, grey in (("stripes", columns), ("dots", dots)):
+        Image.fromarray((100 * grey + 128).astype(np.uint8)).save(tmp_path / f"{name}.png")
+    monkeypatch.setenv("STYLEEXP_ASSETS", str(tmp_path))
+    arguments = ["truth-board", "--pictures", "stripes,dots", "--sources", "sphere"]
+    arguments += ["--vertices", "8000", "--windows", "8", "--judge", "vgg19_random", "--json"]
+    assert main(arguments) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["cases"] == 2
+    assert set(found["rank1"]) == {"style_distance", "relief_distance", "appearance_distance"}
+    assert found["rank1"]["relief_distance"] == 1
+    assert main([*arguments[:2], "bubble", *arguments[3:]]) == 2
+    assert "is a mesh" in capsys.readouterr().err

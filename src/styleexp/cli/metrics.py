@@ -69,6 +69,9 @@ def _parser() -> argparse.ArgumentParser:
 
     truth = commands.add_parser("truth-board", help="test the metrics on results of known style")
     truth.add_argument("--sources", default=",".join(TRUTH_SOURCES), help="names, comma-separated")
+    truth.add_argument(
+        "--pictures", default="", metavar="NAMES", help="pictures instead of the mesh styles"
+    )
     truth.add_argument("--vertices", type=int, default=30_000, help="of each source, about")
     truth.set_defaults(function=_truth, show=_show_truth)
 
@@ -123,9 +126,9 @@ def _board(options: argparse.Namespace) -> dict[str, Any]:
 
 def _truth(options: argparse.Namespace) -> dict[str, Any]:
     from styleexp import meshes, shapes
-    from styleexp.config import SourceConfig
-    from styleexp.metrics.truth import judge_metrics, measure_board
-    from styleexp.sources import load_source
+    from styleexp.config import SourceConfig, StyleConfig
+    from styleexp.metrics import truth
+    from styleexp.sources import load_source, load_style
 
     names = options.sources.split(",")
     sources = []
@@ -137,16 +140,32 @@ def _truth(options: argparse.Namespace) -> dict[str, Any]:
     judge = _judge(options)
     if judge is None:
         raise UserError("--judge none: the truth board tests what a judge sees; name an encoder.")
-    board = measure_board(
-        sources, judge.name, options.windows, lambda told: print(told, file=sys.stderr, flush=True)
-    )
-    found = judge_metrics(board)
+
+    def told(what: str) -> None:
+        print(what, file=sys.stderr, flush=True)
+
+    styles, candidates = list(shapes.STYLES), truth.CANDIDATES
+    if options.pictures:
+        styles, candidates = options.pictures.split(","), truth.PICTURE_CANDIDATES
+        pictures = {}
+        for name in styles:
+            found = load_style(StyleConfig(name=name))
+            if isinstance(found, meshes.Mesh):
+                raise UserError(
+                    f"--pictures: '{name}' is a mesh; without the option all are tested."
+                )
+            pictures[name] = found
+        board = truth.measure_pictures(sources, pictures, judge.name, options.windows, told)
+    else:
+        board = truth.measure_board(sources, judge.name, options.windows, told)
+    verdicts = truth.judge_metrics(board, candidates)
     return {
-        "rank1": {name: verdict["rank1"] for name, verdict in found.items()},
-        "cases": len(names) * len(shapes.STYLES),
+        "rank1": {name: verdict["rank1"] for name, verdict in verdicts.items()},
+        "cases": len(names) * len(styles),
         "sources": names,
+        "styles": styles,
         "judge": judge.name,
-        "metrics": found,
+        "metrics": verdicts,
     }
 
 

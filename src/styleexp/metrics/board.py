@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,12 +13,7 @@ from styleexp import meshes, records
 from styleexp.errors import UserError
 from styleexp.metrics import Judge, measure
 from styleexp.metrics.patches import relief_of_result
-from styleexp.metrics.style import (
-    Looks,
-    appearance_distance,
-    pattern_distance,
-    relief_distance,
-)
+from styleexp.metrics.style import Looks, pattern_distance, relief_distance
 from styleexp.scene import pattern_unit
 from styleexp.sources import load_source, load_style
 
@@ -42,9 +38,9 @@ def measure_board(folder: Path, judge: Judge, write: bool = False) -> dict[str, 
     With ``write`` each run's ``metrics.json`` is replaced by what was measured now.
 
     ``identification`` counts the runs whose result looks nearest to their own style among all
-    styles of the board of its kind, meshes or pictures, which are compared differently
-    (`relief_or_appearance`; ``identification_features`` is the same by what `style_distance`
-    compares); ``of`` is how many runs were done. Those that weren't are listed as such.
+    styles of the board of its kind, meshes or pictures, whose heights are known otherwise (by
+    `relief_distance`; ``identification_features`` is the same by what `style_distance` compares);
+    ``of`` is how many runs were done. Those that weren't are listed as such.
     """
     rows: list[dict[str, Any]] = []
     results: list[tuple[dict[str, Any], Looks]] = []
@@ -71,7 +67,7 @@ def measure_board(folder: Path, judge: Judge, write: bool = False) -> dict[str, 
         relief = relief_of_result(source, vertices, faces, unit)
         results.append((row, judge.looks(config, relief, unit)))
     for row, looks in results:
-        row["looks_like"] = nearest(looks, row["style"], goals, relief_or_appearance)
+        row["looks_like"] = nearest(looks, row["style"], goals, relief_apart)
         row["looks_like_features"] = nearest(looks, row["style"], goals, pattern_distance)
     done = [row for row, _ in results]
     return {
@@ -95,11 +91,11 @@ def nearest(
     return min(rivals, key=lambda name: distance(looks, goals[name]))
 
 
-def relief_or_appearance(result: Looks, style: Looks) -> float:
-    """`relief_distance`, which recognises most of the imperfect results on the truth board; a
-    picture's relief isn't known, so its `appearance_distance`."""
+def relief_apart(result: Looks, style: Looks) -> float:
+    """`relief_distance`, which recognises most of the imperfect results on the truth boards;
+    infinite where no window was seen."""
     apart = relief_distance(result, style)
-    return appearance_distance(result, style) if apart is None else apart
+    return math.inf if apart is None else apart
 
 
 def unit_of(config: Config, source: meshes.Mesh, style: meshes.Mesh | np.ndarray) -> float:

@@ -14,6 +14,7 @@ import torch
 from torch.nn import functional
 
 from styleexp import meshes, styles
+from styleexp.images import luminance
 from styleexp.losses import gram_matrix, layer_mask
 from styleexp.metrics.patches import SIZE, WINDOW, Relief, Windows, blurred, relief_of_mesh, windows
 from styleexp.renderers.base import Shading
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
     from torch import Tensor
 
-    from styleexp.config import Config
+    from styleexp.config import Config, StyleConfig
     from styleexp.encoders import Encoder
     from styleexp.losses import Grams
 
@@ -69,6 +70,7 @@ class Looks:
     height: Grams | None = None
     """None for a picture: its heights are not known."""
     statistics: Statistics | None = None
+    """Of a picture with its brightness for a height, whose unit means nothing."""
 
 
 def judged(relief: Relief, unit: float, encoder: Encoder, count: int, seed: int = 0) -> Looks:
@@ -95,12 +97,25 @@ def judged_style(
     """
     if isinstance(style, meshes.Mesh):
         return judged(relief_of_mesh(style), 1.0, encoder, STYLE_WINDOWS)
+    return judged_picture(style, config.style, picture_span(config, unit) / unit, encoder)
+
+
+def judged_picture(
+    picture: Float[np.ndarray, "height width 3"], config: StyleConfig, span: float, encoder: Encoder
+) -> Looks:
+    """What the judge sees of a picture whose longer side is ``span`` patterns long."""
     level = float(shaded(torch.zeros(1, 8, 8)).mean())
-    picture = styles.tone(torch.from_numpy(style), level, config.style)
-    pixels = picture_span(config, unit) / (WINDOW * unit) * SIZE
-    generator = step_generator(0, 0, stream=12)
-    cut = styles.picture_windows(picture, pixels, SIZE, STYLE_WINDOWS, generator)
-    return Looks(grams(encoder, cut.image[..., 0], cut.coverage > 0.5))
+    rgb = torch.from_numpy(picture)
+
+    def cut(grey: Float[Tensor, "height width"]) -> Float[Tensor, "n size size"]:
+        places = step_generator(0, 0, stream=12)
+        pixels = span / WINDOW * SIZE
+        return styles.picture_windows(grey, pixels, SIZE, STYLE_WINDOWS, places).image[..., 0]
+
+    shown, height = cut(styles.tone(rgb, level, config)), cut(luminance(rgb))
+    everywhere = torch.ones_like(shown, dtype=torch.bool)
+    found = statistics(Windows(height, everywhere))
+    return Looks(grams(encoder, shown, everywhere), None, found)
 
 
 def picture_span(config: Config, unit: float) -> float:
@@ -157,13 +172,17 @@ def relief_distance(result: Looks, style: Looks) -> float | None:
     """Without a neural network: how much two reliefs' `Statistics` differ. 0 is equal.
 
     Energies by the logarithm of their ratio; the rest weighted by how much of the energy is in the
-    band. None for a picture.
+    band. A picture's brightness stands for its height, up to a factor: against it energies are
+    shares of their sum, and how high the relief is doesn't count. None where no window was seen.
     """
     if result.statistics is None or style.statistics is None:
         return None
     a, b = result.statistics, style.statistics
-    floor = FLOOR * b.energy.sum()
-    ea, eb = a.energy.clamp(min=float(floor)), b.energy.clamp(min=float(floor))
+    ea, eb = a.energy, b.energy
+    if style.height is None:
+        ea, eb = (e / e.sum().clamp(min=1e-16) for e in (ea, eb))
+    floor = float(FLOOR * eb.sum())
+    ea, eb = ea.clamp(min=floor), eb.clamp(min=floor)
     weight = (ea / ea.sum()).sqrt() + (eb / eb.sum()).sqrt()
     weight = weight / weight.sum()
     rest = SKEWNESS_WEIGHT * (a.skewness - b.skewness).abs()

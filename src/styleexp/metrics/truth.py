@@ -6,6 +6,9 @@ same style at half and at double its scale, a quarter of its height, noise of th
 frequency, the plain source, a shrunken one. A metric of style has to call the true style nearest,
 to find no style where there is none, and to prefer the right scale. What optimisation leaves is
 never the pure style: at half its height, with noise, in patches it should be recognised, too.
+
+Pictures have a board of their own. What relief a picture stands for isn't known, so it is the one
+that the method takes it for: what is bright is high.
 """
 
 from __future__ import annotations
@@ -18,9 +21,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from styleexp import meshes, shapes
+from styleexp import meshes, shapes, styles
 from styleexp.config import FieldConfig, StyleConfig
 from styleexp.encoders import load_encoder
+from styleexp.height_maps import HeightMap, triplanar
+from styleexp.images import luminance
 from styleexp.losses import gram_matrix, layer_mask
 from styleexp.metrics.patches import WINDOW, Relief, relief_of_mesh, relief_of_result, windows
 from styleexp.metrics.style import (
@@ -30,6 +35,7 @@ from styleexp.metrics.style import (
     gram_distance,
     height_grams,
     judged,
+    judged_picture,
     judged_plain,
     relief_distance,
     style_distance,
@@ -54,6 +60,10 @@ SHRINKAGE = 0.03
 PATCHES = 0.8
 """Of a patchy result, in cycles per radius of the source; half of it is covered."""
 IMPERFECT = ("low", "noisy", "patchy")
+PICTURE_RELIEF = 0.03
+"""Root mean square height of a picture that is laid on a source, in patterns."""
+PICTURE_FREQUENCY = 3.0
+"""Of the noise beside it, in cycles per pattern."""
 ENOUGH = 0.95
 """Share of the cases in which a metric must be right to be kept."""
 
@@ -94,6 +104,12 @@ CANDIDATES: dict[str, Metric] = {
     "view_distance": lambda r, s, p, own: _ratio(r.views, s.views, own.views),
 }
 """Smaller is nearer. The last three are not used; they are here to be compared with."""
+
+
+PICTURE_CANDIDATES = {
+    name: CANDIDATES[name] for name in ("style_distance", "relief_distance", "appearance_distance")
+}
+"""Those that can be asked about a picture."""
 
 
 def wrapped(
@@ -148,16 +164,52 @@ def cases(
     """
     rng = np.random.default_rng(seed)
     normals = meshes.vertex_normals(source.vertices, source.faces)
-    true = wrapped(style, source.vertices, normals, unit, rng)
+
+    def laid(unit: float) -> Float[np.ndarray, " vertices"]:
+        return wrapped(style, source.vertices, normals, unit, rng)
+
+    yield from _variants(laid, source.vertices, unit, frequency, rng)
+
+
+def picture_cases(
+    source: meshes.Mesh, picture: Float[np.ndarray, "height width 3"], unit: float, seed: int
+) -> Iterator[tuple[str, Float[np.ndarray, " vertices"]]]:
+    """The same of a picture, its brightness for a height, projected from three sides."""
+    rng = np.random.default_rng(seed)
+    normals = meshes.vertex_normals(source.vertices, source.faces)
+    height = luminance(torch.from_numpy(picture))
+    edge = meshes.mean_edge_length(source.vertices, source.faces)
+    points = torch.from_numpy(source.vertices + rng.uniform(0, 5, 3)).float()
+    up = torch.from_numpy(normals).float()
+
+    def laid(unit: float) -> Float[np.ndarray, " vertices"]:
+        side = math.sqrt(4 * math.pi) * unit
+        tile = styles.resized(height, min(side / edge, max(height.shape)))
+        tile = (tile - tile.mean()) / tile.std().clamp(min=1e-6)
+        found = triplanar(HeightMap(tile, side), points, up, SHARPNESS)
+        return PICTURE_RELIEF * unit * found.double().numpy()
+
+    yield from _variants(laid, source.vertices, unit, PICTURE_FREQUENCY, rng)
+
+
+def _variants(
+    laid: Callable[[float], Float[np.ndarray, " vertices"]],
+    points: Float[np.ndarray, "vertices 3"],
+    unit: float,
+    frequency: float,
+    rng: np.random.Generator,
+) -> Iterator[tuple[str, Float[np.ndarray, " vertices"]]]:
+    """A relief, ``laid`` at its own scale, and what it must be told from."""
+    true = laid(unit)
     yield "true", true
     yield "faint", 0.25 * true
-    yield "half", wrapped(style, source.vertices, normals, unit / 2, rng)
-    yield "double", wrapped(style, source.vertices, normals, unit * 2, rng)
-    yield "noise", true.std() * noise(source.vertices, frequency / unit, rng)
+    yield "half", laid(unit / 2)
+    yield "double", laid(unit * 2)
+    yield "noise", true.std() * noise(points, frequency / unit, rng)
     yield "shrunken", np.full(len(true), -SHRINKAGE)
     yield "low", 0.5 * true
-    yield "noisy", 0.7 * true + 0.5 * true.std() * noise(source.vertices, frequency / unit, rng)
-    yield "patchy", true / (1 + np.exp(-6 * noise(source.vertices, PATCHES, rng)))
+    yield "noisy", 0.7 * true + 0.5 * true.std() * noise(points, frequency / unit, rng)
+    yield "patchy", true / (1 + np.exp(-6 * noise(points, PATCHES, rng)))
 
 
 def measure_board(
@@ -200,7 +252,40 @@ def measure_board(
     return board
 
 
-def judge_metrics(board: Board) -> dict[str, dict[str, Any]]:
+def measure_pictures(
+    sources: list[meshes.Mesh],
+    pictures: dict[str, Float[np.ndarray, "height width 3"]],
+    judge: str,
+    count: int,
+    told: Callable[[str], None],
+) -> Board:
+    """Lay every picture on every source, with its distractors; as `measure_board`."""
+    encoder = load_encoder(judge)
+    board, span = Board(), StyleConfig().image_tile * math.sqrt(4 * math.pi)
+    for name, picture in pictures.items():
+        looks = judged_picture(picture, StyleConfig(), span, encoder)
+        board.styles[name] = Sample(looks, [], [])
+    board.plain = Sample(judged_plain(encoder), [], [])
+    for number, given in enumerate(sources):
+        frame = meshes.normalisation(given.vertices)
+        source = meshes.Mesh(given.name, frame.apply(given.vertices), given.faces)
+        normals = meshes.vertex_normals(source.vertices, source.faces)
+        unit = pattern_unit(StyleConfig(), source, None)
+        board.own[given.name] = board.plain
+        for picture_number, (name, picture) in enumerate(pictures.items()):
+            seed = 100 * number + picture_number
+            for what, moved in picture_cases(source, picture, unit, seed):
+                vertices = source.vertices + moved[:, None] * normals
+                relief = relief_of_result(source, vertices, source.faces, unit)
+                looks = judged(relief, unit, encoder, count)
+                board.cases[given.name, name, what] = Sample(looks, [], [])
+            told(f"{given.name}, {name}")
+    return board
+
+
+def judge_metrics(
+    board: Board, candidates: dict[str, Metric] = CANDIDATES
+) -> dict[str, dict[str, Any]]:
     """How often each candidate is right, as shares of the cases.
 
     ``rank1``: the true style is the nearest of all. ``scale``: the style at its own scale is nearer
@@ -209,7 +294,7 @@ def judge_metrics(board: Board) -> dict[str, dict[str, Any]]:
     metrics that are ratios, within a tenth of 1. ``imperfect``: as ``rank1``, of results at half
     height, with noise, in patches. ``confusions`` lists what went wrong among the true ones.
     """
-    return {name: _verdict(metric, board) for name, metric in CANDIDATES.items()}
+    return {name: _verdict(metric, board) for name, metric in candidates.items()}
 
 
 def _verdict(metric: Metric, board: Board) -> dict[str, Any]:
