@@ -298,7 +298,7 @@ def _watch(changes: list[int], watched: str, dies_at: int, torn: bool = False) -
         changes[0] += 1
         if changes[0] != dies_at:
             return
-        if torn and event == "os.rename":
+        if torn and event == "os.rename" and ".partial" in path:
             os.truncate(path, os.path.getsize(path) // 2)
         if torn and event == "open" and "a" in str(given[1]):
             handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
@@ -794,12 +794,13 @@ def damaged_checkpoint(stage: Stage, chance: random.Random) -> str:
             damage(folder / name, chance)
     done = stage.command(f"resume={folder}")
     assert done.code == 0, done.complained[-2000:]
-    (said,) = (x for x in done.told.splitlines() if "is damaged" in x)
+    (said,) = (x for x in done.told.splitlines() if "safetensors is damaged" in x)
     anew = "checkpoint.previous.safetensors" in names
     assert ("the run begins anew" if anew else "the checkpoint before it is used") in said
-    if "metrics.jsonl" in names:  # what it held of the steps before is lost
-        kept = [line for line in lines(stage.whole) if line in lines(folder)]
-        assert kept[-1:] == lines(stage.whole)[-1:]
+    lost = [line for line in lines(stage.whole) if line not in lines(folder)]
+    assert len(lost) == 0 or "metrics.jsonl" in names
+    if "metrics.jsonl" in names:  # a flipped bit may be one of the clock's
+        assert f"the lines of {len(lost)} steps are lost" in done.told or len(lost) <= 1
         (folder / "metrics.jsonl").write_bytes((stage.whole / "metrics.jsonl").read_bytes())
     check_same(folder, stage.whole)
     shutil.rmtree(folder)

@@ -123,18 +123,18 @@ def test_the_instruments_leave_the_renderer_as_it_was():
 
 
 def test_a_steps_parts_sum_to_the_step(smoke):
-    found = step.measure(smoke, 3)
+    found = step.measure(smoke, 1)  # of several, medians are told, which don't sum
     for key in ("", "cpu_"):
         parts, whole = found[f"parts_{key}ms"], found[f"step_{key}ms"]
-        assert sum(parts.values()) / whole == pytest.approx(1, abs=0.25)
+        assert sum(parts.values()) == pytest.approx(whole)
         assert 0 < found["encoder_share"] < 1
     expected = {"field", "normals", "render", "image views", "encoder", "loss", "optimiser"}
     expected |= {"field backward", "render backward", "encoder backward", "loss backward"}
     expected |= {"Gram matrices", "Gram matrices backward"}
     assert expected <= set(found["parts_ms"])
-    assert found["encoder_over_floor"] >= found["encoder_over_convolutions"] > 0.5
+    assert found["encoder_over_floor"] >= found["encoder_over_convolutions"] > 0
     assert found["threads"] == 1
-    assert found["steps"] == 3
+    assert found["steps"] == 1
 
 
 def test_the_parts_do_not_change_the_result(smoke):

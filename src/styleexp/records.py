@@ -109,23 +109,43 @@ class RunFolder:
                 (self.path / name).unlink(missing_ok=True)
             shutil.rmtree(self.path / "tensorboard", ignore_errors=True)
 
+    def forget(self) -> None:
+        """Remove the checkpoints: the run is to begin anew."""
+        for path in (self.checkpoint, self.path / "checkpoint.previous.safetensors"):
+            with suppress(OSError):
+                path.unlink()
+
+    def check(self) -> None:
+        """``FileNotFoundError`` where somebody removed what the run wrote while it was at work."""
+        for name in ("run.json", "result.ply"):
+            (self.path / name).stat()
+
     def append_metrics(self, step: Step) -> None:
-        """Add a step's line."""
-        with open(self.metrics, "a", encoding="utf-8") as lines:
+        """Add a step's line. ``FileNotFoundError`` where somebody removed those before it."""
+        create = os.O_CREAT if step.step == 1 else 0
+        descriptor = os.open(self.metrics, os.O_WRONLY | os.O_APPEND | create, 0o666)
+        with open(descriptor, "a", encoding="utf-8") as lines:
             lines.write(json.dumps(asdict(step)) + "\n")
 
-    def truncate_metrics(self, step: int) -> None:
-        """Drop lines after ``step``: a resumed run will write them again."""
-        if not self.metrics.exists():
-            return
-        kept = []
-        for line in self.metrics.read_text(encoding="utf-8").splitlines():
+    def begin_metrics(self, step: int) -> int:
+        """Keep the lines of the steps up to ``step``: a resumed run will write the others again.
+
+        Returns how many of those that should be there are lost.
+        """
+        if not step:
+            self.metrics.unlink(missing_ok=True)
+            return 0
+        kept: dict[int, bytes] = {}
+        old = self.metrics.read_bytes() if self.metrics.exists() else b""
+        for line in old.split(b"\n"):
             try:
-                if json.loads(line)["step"] <= step:
-                    kept.append(line + "\n")
+                found = json.loads(line)["step"]
             except (ValueError, KeyError, TypeError):
                 continue  # a line cut off by the interruption
-        self.write("metrics.jsonl", atomic.text("".join(kept)))
+            if isinstance(found, int) and 0 < found <= step:
+                kept[found] = line + b"\n"
+        self.write("metrics.jsonl", atomic.data(b"".join(kept[n] for n in sorted(kept))))
+        return step - len(kept)
 
     def save_checkpoint(self, state: State) -> None:
         """Field, optimiser and step in one safetensors file; the one before is kept beside it."""

@@ -139,6 +139,14 @@ def _guarded(
                 f"the run's folder '{folder.path}' was removed while the run was at work: start "
                 "the run anew."
             ) from error
+        if isinstance(error, FileNotFoundError) and _within(error.filename, folder.path):
+            told = (
+                f"files of the run's folder '{folder.path}' were removed while the run was at "
+                "work: start the run anew."
+            )
+            folder.forget()
+            _fail(folder, told)
+            raise UserError(told) from error
         _fail(folder, str(error))
         raise UserError(
             f"writing to '{folder.path}' failed ({error.strerror or error}): free some space or "
@@ -159,6 +167,12 @@ def _guarded(
         )
         _fail(folder, told)
         raise UserError(told) from error
+
+
+def _within(name: object, folder: Path) -> bool:
+    if not isinstance(name, str | Path):
+        return False
+    return Path(os.path.abspath(name)).is_relative_to(os.path.abspath(folder))
 
 
 def _out_of_memory(error: BaseException) -> bool:
@@ -204,7 +218,9 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
         if told:
             print(f"note: {told}")
         print(f"resuming at step {state.step} of {config.optim.steps}")
-        folder.truncate_metrics(state.step)
+        lost = folder.begin_metrics(state.step)
+        if lost:
+            print(f"note: metrics.jsonl is damaged: the lines of {lost} steps are lost.")
     record |= {
         "device": str(scene.surface.vertices.device),
         "threads": torch.get_num_threads(),
@@ -229,6 +245,7 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
 
             written.insert(0, page.write_ended(folder.path, result, seconds))
         loggers.finish(result, folder.path, measured, step)
+        folder.check()
         folder.write_status("done", step=step, seconds=round(seconds, 1))
     print(f"done in {seconds:.0f} s")
     _print_paths(written)
@@ -254,7 +271,8 @@ def _optimise(
                 loggers.ended = "interrupted"
                 print(f"\nstopped at step {state.step}; go on with: styleexp resume={folder.path}")
                 return False
-    folder.save_checkpoint(state)
+    if folder.checkpoint_step() != state.step:
+        folder.save_checkpoint(state)
     if blank:
         what = "were skipped" if scene.config.loss.masked else "counted as background"
         print(
