@@ -1,9 +1,10 @@
-"""Many runs in one process, and a sweep of many jobs: does anything grow, leak or get lost?
+"""Many steps in a run, many runs in one process, and a sweep of many jobs: does anything grow, leak
+or get lost?
 
-    python benchmarks/long_haul.py                          # 500 runs, 2000 jobs
-    python benchmarks/long_haul.py --runs 100 --jobs 0      # only the first, shorter
-    python benchmarks/long_haul.py --runs 0 --jobs 2000 --launcher joblib
-    python benchmarks/long_haul.py --seconds 1800           # as many of both as there is time for
+    python benchmarks/long_haul.py                          # 500 steps, 500 runs, 2000 jobs
+    python benchmarks/long_haul.py --runs 100 --jobs 0 --steps 0    # only the runs, fewer
+    python benchmarks/long_haul.py --runs 0 --jobs 2000 --steps 0 --launcher joblib
+    python benchmarks/long_haul.py --seconds 1800           # as many of all as there is time for
 
 Prints and writes into docs/robustness.md: memory and its slope after a warm-up (least squares),
 what of it the C library has given out (where that is glibc: the rest are holes between), open
@@ -35,7 +36,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs" / "robustness.md"
 MARKS = {
     kind: (f"<!-- begin: benchmarks/long_haul.py, {kind} -->\n", f"<!-- end: {kind} -->\n")
-    for kind in ("runs", "jobs")
+    for kind in ("steps", "runs", "jobs")
 }
 SMALL = (
     "profile=smoke", "encoder=vgg16", "optim.steps=1", "views.resolution=48",
@@ -51,7 +52,7 @@ class Sample:
     """What a process, or several, hold at a moment."""
 
     at: float
-    """Runs done, or seconds."""
+    """Steps, runs or jobs done."""
     memory: float
     """Resident, in MB."""
     files: int
@@ -118,6 +119,27 @@ def prepare(folder: Path) -> None:
         meshes.save_mesh(mesh, mesh.vertices, folder / f"{name}.ply")
     rows = (np.sin(np.arange(96) / 3) * 100 + 128).astype(np.uint8)
     Image.fromarray(np.repeat(rows[:, None], 96, axis=1)).save(folder / "rows.png")
+
+
+# --------------------------------------------------------------------------------- steps, one run
+
+
+def many_steps(count: int, until: float, every: int = 5) -> list[Sample]:
+    """Take so many steps of a run with the sizes of ``profile=fast``."""
+    from styleexp import baselines
+    from styleexp.compose import compose
+
+    given = ["source=torus", "style=bubble", "profile=fast", "threads=1", f"optim.steps={count}"]
+    config = compose(given)
+    method = baselines.method(config)
+    scene = method.prepare(config)
+    samples = []
+    for step in method.optimise(scene, method.start(scene)):
+        if step.step % every == 0:
+            samples.append(Sample(step.step, *of_process(os.getpid()), used=given_out()))
+        if time.perf_counter() > until and samples:
+            break
+    return samples
 
 
 # ------------------------------------------------------------------------------ runs, one process
@@ -274,9 +296,10 @@ def write(kind: str, text: str) -> None:
 def main() -> int:
     """Run both, write what was found."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--steps", type=int, default=500)
     parser.add_argument("--runs", type=int, default=500)
     parser.add_argument("--jobs", type=int, default=2000)
-    parser.add_argument("--seconds", type=float, default=float("inf"), help="for both together")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="for all together")
     parser.add_argument("--launcher", default="basic", choices=["basic", "joblib"])
     options = parser.parse_args()
     started = time.perf_counter()
@@ -291,6 +314,13 @@ def main() -> int:
     (folder / "tmp").mkdir()
     try:
         prepare(folder)
+        if options.steps:
+            begun = time.perf_counter()
+            samples = many_steps(options.steps, started + options.seconds / 4)
+            minutes = (time.perf_counter() - begun) / 60
+            text = f"One run of {samples[-1].at:.0f} steps, torus with bubbles at `profile=fast`, "
+            text += f"{minutes:.0f} min:\n\n"
+            write("steps", text + HEAD + row("the process", "step", samples))
         if options.runs:
             begun, used = time.perf_counter(), time.process_time()
             samples = many_runs(options.runs, folder, started + options.seconds / 2)

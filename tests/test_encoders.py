@@ -198,6 +198,30 @@ def test_gram_sums_are_those_of_the_activations(precision, pooling, layers, monk
     assert ours.norm() / theirs.norm() == pytest.approx(1, abs=0.01)
 
 
+def test_masks_of_every_size_make_products_of_a_few_shapes():
+    """oneDNN keeps code for each shape: a hundred new ones a step would fill the memory."""
+
+    seen = set()
+
+    class Shapes(TorchDispatchMode):
+        def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+            if func is torch.ops.aten.mm.default:
+                seen.add(args[1].shape)
+            return func(*args, **(kwargs or {}))
+
+    activation = torch.rand(2, 8, 48, 48, generator=torch.Generator().manual_seed(0))
+    order = torch.rand(2 * 48 * 48, generator=torch.Generator().manual_seed(1)).argsort()
+    for count in range(0, len(order), 31):
+        mask = torch.zeros(len(order), dtype=torch.bool)
+        mask[order[:count]] = True
+        mask = mask.view(2, 48, 48)
+        with Shapes():
+            found = fused.gram(activation, mask)
+        cells = activation.permute(0, 2, 3, 1)[mask]
+        assert torch.allclose(found, cells.t() @ cells, rtol=1e-4)
+    assert 1 < len(seen) <= 10
+
+
 def test_gram_sums_follow_weights_that_change():
     encoder = build()
     assert encoder.is_fused

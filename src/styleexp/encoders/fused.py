@@ -32,6 +32,9 @@ PART = 16 << 20
 """Bytes of a part's activations. glibc maps arrays above 32 MB anew each time."""
 ROWS = 2048
 """Cells whose product is rounded at once; the sums of those are float32's."""
+EVEN = 256
+"""Masked cells are filled up with zeros to a multiple of this. oneDNN keeps code and memory for
+each of a thousand shapes; masks that gave it new ones each step filled 9 GB in a hundred steps."""
 
 _ONE = [1, 1]
 
@@ -134,7 +137,10 @@ def gram(activation: Tensor, mask: Mask) -> Float[Tensor, "channels channels"]:
     products of so many, stays below 0.2 %."""
     cells = activation.permute(0, 2, 3, 1).flatten(0, 2)
     if mask is not None:
-        cells = cells.index_select(0, mask.flatten().nonzero().view(-1))
+        seen = mask.flatten().nonzero().view(-1)
+        count = len(seen)
+        cells = cells.index_select(0, functional.pad(seen, (0, -count % EVEN)))
+        cells[count:] = 0
     total = torch.zeros(cells.shape[1], cells.shape[1])
     for some in cells.split(ROWS):
         total += some.t() @ some
