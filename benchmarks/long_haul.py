@@ -203,12 +203,20 @@ def many_runs(count: int, folder: Path, until: float, every: int = 5) -> list[Sa
 
 
 def plan(jobs: int, folder: Path) -> Path:
-    """A plan of so many jobs: two sources, two styles, as many seeds as it takes."""
+    """A plan of so many jobs: two sources, two styles, as many seeds as it takes. A tenth of them
+    learn; the others lay the style's height map on, as a sweep's jobs are here for what is around
+    them: composing, launching, locks, records, tables."""
     small = ", ".join(SMALL)
     text = f"profile: smoke\noverrides: [{small}, metrics.judge=none]\nexperiments:\n"
-    text += f"  - name: many\n    seeds: [{', '.join(str(n) for n in range(-(-jobs // 4)))}]\n"
-    text += f'    overrides: ["source.path={folder}/ball.ply,{folder}/ring.ply", '
-    text += f'"style.path={folder}/knobs.ply,{folder}/ridges.ply"]\n'
+    learning = max(1, jobs // 40)
+    pairs = f'"source.path={folder}/ball.ply,{folder}/ring.ply", '
+    pairs += f'"style.path={folder}/knobs.ply,{folder}/ridges.ply"'
+    for name, method, count in (
+        ("learned", "robust", learning),
+        ("laid", "displacement_map", -(-jobs // 4) - learning),
+    ):
+        text += f"  - name: {name}\n    seeds: [{', '.join(map(str, range(count)))}]\n"
+        text += f'    overrides: [{pairs}, "method={method}"]\n'
     path = folder / "plan.yaml"
     path.write_text(text)
     return path
@@ -251,9 +259,9 @@ def many_jobs(
                     samples.setdefault(pid, []).append(Sample(done, *of_process(pid)))
     seconds = time.perf_counter() - begun
     rows = []
-    if (table := folder / "sweep" / "many" / "table.csv").exists():
+    for table in (folder / "sweep").glob("*/table.csv"):
         with open(table, newline="") as file:
-            rows = list(csv.DictReader(file))
+            rows += csv.DictReader(file)
     found = {
         "reached": done,
         "code": runner.returncode, "rows": len(rows), "seconds": seconds, "planned": planned,
@@ -339,9 +347,9 @@ def main() -> int:
             text += f"{found['seconds'] / 60:.0f} min in all, {found['planned']:.0f} s before the "
             text += "first job was done; "
             if ended:
-                text += f"exit code {found['code']}, {found['rows']} rows in its table, "
+                text += f"exit code {found['code']}, {found['rows']} rows in its tables, "
                 text += f"{found['done']} of them done, {found['report']:.0f} s from the last job "
-                text += "to the end (table and figure):\n\n"
+                text += "to the end (tables and figures):\n\n"
                 wrong |= found["code"] != 0 or found["done"] != options.jobs
             else:
                 text += f"stopped after {found['reached']} jobs, as time was up:\n\n"
