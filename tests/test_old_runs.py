@@ -91,12 +91,12 @@ def test_a_run_without_a_version_of_its_layout_is_of_the_first(old):
 def test_one_is_measured_and_resumed_from_a_checkpoint_without_a_digest(old, capsys):
     from safetensors.torch import load_file, save_file
 
-    at = old(LATER, versions={**OLD[LATER]["run.json"]["versions"], "torch": "2.9.0"})
+    at = old(LATER, versions={**OLD[LATER]["run.json"]["versions"], "torch": "2.0.1"})
     assert metrics_command(["run", str(at), "--judge", "none"]) == 0
     assert resume(at) == 0  # there is no checkpoint: from the first step on
     told = capsys.readouterr().out
     assert "the run was begun with " in told
-    assert "torch 2.9.0 (now " in told
+    assert "torch 2.0.1 (now " in told
     whole = (at / "result.ply").read_bytes()
     checkpoint = at / "checkpoint.previous.safetensors"
     (at / "checkpoint.safetensors").unlink()
