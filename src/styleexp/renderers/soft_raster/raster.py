@@ -1,38 +1,44 @@
 """Visibility: which face is seen at which pixel. Nothing here is differentiated.
 
-Faces become triangles in pixel coordinates (``Triangles``), clipped at the near plane; these are
-tested against the pixel centres in their bounding boxes; the nearest hit of each pixel wins.
+Faces become triangles in pixel coordinates (``Triangles``), clipped at the near plane; in each row
+of pixels these are spans between two edges; the nearest of each pixel's spans wins.
 
-The tests are watertight: the edge function of an edge is the same number, bit for bit, from its two
+The spans are watertight: where an edge crosses a row is the same number, bit for bit, from its two
 sides, because it is anchored at the edge's midpoint, and a pixel centre on an edge belongs to the
 side given by the top-left rule.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
     from torch import Tensor
 
-_BOX_SIZES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
-"""Bounding boxes are padded to these sizes; larger ones are filled row by row."""
-_CHUNK = 1 << 20
-"""Most pixel candidates that are tested at once: bounds memory, and keeps the work in cache."""
+_CHUNK = 1 << 18
+"""About how many rows of triangles, or pixels of rows, are worked on at once: bounds memory."""
+_FAR = 1e30
+"""Added to where an edge crosses a row, it takes the edge out of a maximum or minimum."""
 
 
 @dataclass(frozen=True)
 class FacePairs:
-    """Pairs (view, face) that may be seen: facing the camera and not wholly outside the frame."""
+    """Pairs (view, face) that may be seen: facing the camera and not wholly outside the frame.
+
+    In order of the views, and in each of the faces.
+    """
 
     view: Int[Tensor, " pairs"]
     face: Int[Tensor, " pairs"]
     needs_clipping: Bool[Tensor, " pairs"]
     """A corner lies in front of the near plane, or behind the camera."""
+    chosen: Bool[Tensor, "views faces"]
+    """The pairs as a mask."""
 
 
 @dataclass(frozen=True)
@@ -91,18 +97,29 @@ def candidate_pairs(
     outside |= (y < 0).byte() << 2
     outside |= (y > height * w).byte() << 3
     outside |= (w < near).byte() << 4
-    outside = outside.view(-1)
 
-    count = points.shape[2]
-    hit = front.reshape(-1).nonzero().view(-1)
-    view = hit // max(front.shape[1], 1)
-    face = hit - view * front.shape[1]
-    first = view * count
-    codes = [outside.index_select(0, first + corner.index_select(0, face)) for corner in corners]
-    inside = (codes[0] & codes[1] & codes[2]) == 0
-    keep = inside.nonzero().view(-1)
-    crosses = ((codes[0] | codes[1] | codes[2]) & 16) != 0
-    return FacePairs(view[keep], face[keep], crosses[keep])
+    a, b, c = (outside.index_select(1, corner) for corner in corners)
+    chosen = ((a & b & c) == 0).logical_and_(front)
+    view, face = positions(chosen)
+    crosses = (((a | b | c) & 16) != 0).view(-1)[view * front.shape[1] + face]
+    return FacePairs(view, face, crosses, chosen)
+
+
+def positions(mask: Bool[Tensor, "rows columns"]) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
+    """Row and column of what is true, in order."""
+    place = true_indices(mask.reshape(-1))
+    rows, columns = mask.shape
+    ends = torch.searchsorted(place, torch.arange(1, rows + 1, device=mask.device) * columns)
+    counts = ends.diff(prepend=ends.new_zeros(1))
+    row = torch.repeat_interleave(counts, output_size=len(place))
+    return row, place - row * columns
+
+
+def true_indices(mask: Bool[Tensor, " n"]) -> Int[Tensor, " true"]:
+    """Where a mask is true. On the CPU by numpy, whose search has no branches: 7 times as fast."""
+    if mask.device.type != "cpu":
+        return mask.nonzero().view(-1)
+    return torch.from_numpy(np.flatnonzero(mask.numpy()))
 
 
 def rasterise(
@@ -116,22 +133,18 @@ def rasterise(
     views = points.shape[1]
     height, width = resolution
     best = torch.zeros(views * height * width, dtype=torch.int64, device=points.device)
-
     triangles = _triangles(points, corners, pairs, near)
-    low_x, high_x = _pixel_range(triangles.x, width)
-    low_y, high_y = _pixel_range(triangles.y, height)
-    span = torch.maximum(high_x - low_x, high_y - low_y)
-    has_pixel = (high_x >= low_x) & (high_y >= low_y)
-    sizes = torch.tensor(_BOX_SIZES, device=points.device)
-    bucket = torch.bucketize(span + 1, sizes)
-    bucket = torch.where(has_pixel, bucket, -1)
-    for index, size in enumerate(_BOX_SIZES):
-        members = (bucket == index).nonzero().view(-1)
-        for part in members.split(max(1, _CHUNK // size**2)) if members.numel() else ():
-            _test_boxes(best, triangles, part, low_x, low_y, size, resolution)
-    members = (bucket == len(_BOX_SIZES)).nonzero().view(-1)
-    if members.numel():
-        _test_rows(best, triangles, members, low_y, high_y, resolution)
+    first, rows = _rows(triangles, resolution)
+    order, groups = _by_count(rows)
+    setup = _set_up(triangles, first, order, resolution)
+    found, held = [], 0
+    for count, part in groups:
+        found.append(_spans(setup, part, count, width))
+        held += len(found[-1].start)
+        if held > _CHUNK:
+            _fill(best, found)
+            found, held = [], 0
+    _fill(best, found)
     return _winners(best, (views, height, width), points.dtype)
 
 
@@ -199,131 +212,181 @@ def _cut(a: Float[Tensor, "3 n"], b: Float[Tensor, "3 n"], near: float) -> Float
     return point
 
 
-def _pixel_range(values: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """First and last pixel whose centre lies within the three corners' range and the frame.
+def _rows(
+    t: Triangles, resolution: tuple[int, int]
+) -> tuple[Float[Tensor, " triangles"], Int[Tensor, " triangles"]]:
+    """The first row of pixel centres that each triangle may contain, and how many.
 
-    None, with a corner that is not a number.
+    From its top, included, to its bottom, excluded; none for one that lies between two columns, or
+    has a corner that is not a number.
     """
-    low = torch.ceil(values.amin(0) - 0.5).nan_to_num(nan=size).clamp(0, size)
-    high = torch.floor(values.amax(0) - 0.5).nan_to_num(nan=-1.0).clamp(-1, size - 1)
-    return low.long(), high.long()
+    height, width = resolution
+    first = torch.ceil(t.y.amin(0) - 0.5).clamp_(0, height)
+    count = torch.ceil(t.y.amax(0) - 0.5).clamp_(0, height) - first
+    # Rounding may move where an edge crosses a row: left out is what is clearly between columns.
+    left = torch.ceil(t.x.amin(0) - 0.51).clamp_(0, width)
+    right = torch.ceil(t.x.amax(0) - 0.49).clamp_(0, width)
+    return first, count.mul_(right > left).nan_to_num_(nan=0.0).to(torch.int32)
+
+
+def _by_count(counts: Int[Tensor, " n"]) -> tuple[Int[Tensor, " m"], list[tuple[int, slice]]]:
+    """Of items that hold ``counts`` elements each the m that hold any, first those with one, then
+    those with two, and so on; and the parts of this order that hold equally many.
+
+    Such a part is worked on as one dense array, of not many more than _CHUNK elements.
+    """
+    if counts.device.type == "cpu":  # numpy sorts short integers by their digits
+        most = int(counts.max()) if len(counts) else 0
+        short = counts.to(torch.int16 if most < 1 << 15 else torch.int32)
+        order = torch.from_numpy(np.argsort(short.numpy(), kind="stable"))
+    else:
+        order = counts.argsort(stable=True)
+    per_count = torch.bincount(counts).tolist()
+    order = order[sum(per_count[:1]) :]
+    parts, begin = [], 0
+    for count, size in enumerate(per_count[1:], 1):
+        end = begin + size
+        most = max(1, _CHUNK // count)
+        parts += [(count, slice(i, min(i + most, end))) for i in range(begin, end, most)]
+        begin = end
+    return order, parts
 
 
 @dataclass(frozen=True)
-class _Edge:
-    """One edge of each triangle, turned so that the pixel centres on it are on its inner side."""
+class _Edges:
+    """One edge of each triangle. It crosses row ``y`` at ``x + (y - middle_y) * slope``.
 
-    mx: Tensor
-    my: Tensor
-    dx: Tensor
-    dy: Tensor
-    turned: Tensor
-    """Whether the triangle is on the other side: outside of it, then, means inside."""
-
-
-def _edges(x: Tensor, y: Tensor) -> list[_Edge]:
-    """The edges by their midpoints and directions.
-
-    Of the two directions of an edge one is its own, by the top-left rule: downwards, or to the left
-    where it is level. Two faces that share an edge so do the very same arithmetic for it.
+    ``x`` is ``left`` for the edges that bound a triangle on its left, ``right`` for those on its
+    right; for others it is so far away that they bound nothing. An edge that goes down has the
+    triangle to its right, and what is on it belongs there; one that goes up, to its left. Level
+    edges bound no row: the choice of rows sees to them.
     """
-    result = []
+
+    left: Float[Tensor, " triangles"]
+    right: Float[Tensor, " triangles"]
+    middle_y: Float[Tensor, " triangles"]
+    slope: Float[Tensor, " triangles"]
+
+
+@dataclass(frozen=True)
+class _Setup:
+    """What is known of triangles before their pixels."""
+
+    edges: tuple[_Edges, ...]
+    first: Float[Tensor, " triangles"]
+    """The first row."""
+    start: Int[Tensor, " triangles"]
+    """Index of the first row's first pixel into the flattened (views, height, width)."""
+    low: Int[Tensor, " triangles"]
+    """The lower half of the depth test's key: the inverted index of the face."""
+    x: Float[Tensor, " triangles"]
+    y: Float[Tensor, " triangles"]
+    inverse_w: Float[Tensor, " triangles"]
+    """1/w at ``(x, y)``; from there it is linear in the image."""
+    slope_x: Float[Tensor, " triangles"]
+    slope_y: Float[Tensor, " triangles"]
+    lowest: Float[Tensor, " triangles"]
+    """A sliver's slopes may be anything: the range of its corners bounds 1/w."""
+    highest: Float[Tensor, " triangles"]
+
+
+def _set_up(
+    t: Triangles, first: Tensor, order: Int[Tensor, " m"], resolution: tuple[int, int]
+) -> _Setup:
+    """The triangles in an order."""
+    height, width = resolution
+    x, y, q = ([row.index_select(0, order) for row in each] for each in (t.x, t.y, t.inverse_w))
+    view, face, first = (each.index_select(0, order) for each in (t.view, t.face, first))
+    edges = []
     for a, b in ((0, 1), (1, 2), (2, 0)):
         dx, dy = x[b] - x[a], y[b] - y[a]
-        turned = (dy < 0) | ((dy == 0) & (dx > 0))
-        sign = 1 - 2 * turned.to(dx.dtype)
-        middle_x, middle_y = (x[a] + x[b]) * 0.5, (y[a] + y[b]) * 0.5
-        result.append(_Edge(middle_x, middle_y, dx * sign, dy * sign, turned))
-    return result
-
-
-def _inverse_depth_plane(t: Triangles, part: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
-    """Slopes of 1/w, which is linear in the image, its first corner's value, and its range."""
-    q = t.inverse_w.index_select(1, part)
+        middle_x, middle_y = (x[a] + x[b]).mul_(0.5), (y[a] + y[b]).mul_(0.5)
+        left = middle_x.sub((dy <= 0).to(dx.dtype), alpha=_FAR)
+        right = middle_x.add((dy >= 0).to(dx.dtype), alpha=_FAR)
+        slope = dx.div_(dy).nan_to_num_(nan=0.0, posinf=0.0, neginf=0.0)
+        edges.append(_Edges(left, right, middle_y, slope))
     x1, x2, y1, y2 = x[1] - x[0], x[2] - x[0], y[1] - y[0], y[2] - y[0]
-    area = x1 * y2 - x2 * y1
-    # A sliver's slopes may be anything; its range then bounds the depth.
-    scale = torch.where(area == 0, 0.0, 1 / area)
     q1, q2 = q[1] - q[0], q[2] - q[0]
-    return (
-        (q1 * y2 - q2 * y1) * scale,
-        (q2 * x1 - q1 * x2) * scale,
+    scale = (x1 * y2).sub_(x2 * y1).reciprocal_().nan_to_num_(posinf=0.0, neginf=0.0)
+    slope_x = (q1 * y2).sub_(q2 * y1).mul_(scale)
+    slope_y = (q2 * x1).sub_(q1 * x2).mul_(scale)
+    start = view.mul_(height).add_(first.long()).mul_(width)
+    return _Setup(
+        tuple(edges),
+        first,
+        start,
+        face.bitwise_not_().bitwise_and_(0xFFFFFFFF),
+        x[0],
+        y[0],
         q[0],
-        q.amin(0),
-        q.amax(0),
+        slope_x,
+        slope_y,
+        torch.minimum(torch.minimum(q[0], q[1]), q[2]),
+        torch.maximum(torch.maximum(q[0], q[1]), q[2]),
     )
 
 
-def _test_boxes(
-    best: Tensor,
-    t: Triangles,
-    part: Tensor,
-    low_x: Tensor,
-    low_y: Tensor,
-    size: int,
-    resolution: tuple[int, int],
-) -> None:
-    """Test dense (size, size) boxes of pixels; the triangles are the innermost dimension."""
-    height, width = resolution
-    count, device = part.numel(), part.device
-    x, y = t.x.index_select(1, part), t.y.index_select(1, part)
-    # A padded box must not stick out of the frame.
-    left = low_x.index_select(0, part).clamp_max(max(width - size, 0))
-    top = low_y.index_select(0, part).clamp_max(max(height - size, 0))
-    columns, rows = min(size, width), min(size, height)
-    center_x = (left + torch.arange(columns, device=device)[:, None]).to(x.dtype) + 0.5
-    center_y = (top + torch.arange(rows, device=device)[:, None]).to(y.dtype) + 0.5
-    inside = None
-    for edge in _edges(x, y):
-        along = (center_x - edge.mx) * edge.dy
-        across = (center_y - edge.my) * edge.dx
-        within = (along[None, :, :] >= across[:, None, :]).logical_xor_(edge.turned)
-        inside = within if inside is None else inside.logical_and_(within)
-    assert inside is not None
-    hit = inside.view(-1).nonzero().view(-1)
-    # Look up what a cell of the box means: cheaper than arithmetic on 64-bit integers.
-    cell = hit // count
-    row, column = torch.meshgrid(
-        torch.arange(rows, device=device), torch.arange(columns, device=device), indexing="ij"
+@dataclass(frozen=True)
+class _Spans:
+    """Pixels of rows that lie in a triangle."""
+
+    start: Int[Tensor, " spans"]
+    """Index of the first pixel into the flattened (views, height, width)."""
+    count: Int[Tensor, " spans"]
+    inverse_w: Float[Tensor, " spans"]
+    """1/w at the first pixel's centre."""
+    slope: Float[Tensor, " spans"]
+    """What 1/w grows by from pixel to pixel."""
+    low: Int[Tensor, " spans"]
+
+
+def _spans(setup: _Setup, part: slice, rows: int, width: int) -> _Spans:
+    """The spans of triangles that meet equally many rows, as dense arrays of (rows, triangles)."""
+    s = replace(setup, **{f.name: getattr(setup, f.name)[part] for f in fields(setup)[1:]})
+    step = torch.arange(rows, device=s.x.device)[:, None]
+    y = s.first + (step + 0.5).to(s.x.dtype)
+    begin = y.new_full(y.shape, -_FAR)
+    beyond = y.new_full(y.shape, _FAR)
+    for edges in setup.edges:
+        crossing = (y - edges.middle_y[part]).mul_(edges.slope[part])
+        torch.maximum(begin, crossing + edges.left[part], out=begin)
+        torch.minimum(beyond, crossing.add_(edges.right[part]), out=beyond)
+    for end in (begin, beyond):
+        end.sub_(0.5).ceil_().clamp_(0, width)
+    # Both ends are pixels' centres: a triangle with corners that are not numbers has no rows.
+    count = beyond.sub_(begin).clamp_min_(0)
+    steps = (count - 1).clamp_min_(0)
+    by_y = (y - s.y).mul_(s.slope_y).add_(s.inverse_w)
+    x = (begin - s.x).add_(0.5)
+    left = (x * s.slope_x).add_(by_y).nan_to_num_()
+    right = x.add_(steps).mul_(s.slope_x).add_(by_y).nan_to_num_()
+    left, right = torch.clamp(left, s.lowest, s.highest), torch.clamp(right, s.lowest, s.highest)
+    slope = right.sub_(left).div_(steps.clamp_min_(1))
+    return _Spans(
+        begin.long().add_(s.start + step * width).view(-1),
+        count.to(torch.int32).view(-1),
+        left.float().view(-1),
+        slope.float().view(-1),
+        s.low.expand(rows, -1).reshape(-1),
     )
-    row, column = row.reshape(-1), column.reshape(-1)
-    member = hit - ((row * columns + column) * count).index_select(0, cell)
-
-    slope_x, slope_y, first, lowest, highest = _inverse_depth_plane(t, part, x, y)
-    by_x = (slope_x * (center_x - x[0])).view(-1)
-    by_y = (slope_y * (center_y - y[0]) + first).view(-1)
-    inverse_w = by_x.index_select(0, (column * count).index_select(0, cell) + member)
-    inverse_w += by_y.index_select(0, (row * count).index_select(0, cell) + member)
-    inverse_w = torch.clamp(
-        inverse_w.nan_to_num_(),  # of a sliver's infinite slopes
-        lowest.index_select(0, member),
-        highest.index_select(0, member),
-    )
-    corner = (t.view.index_select(0, part) * height + top) * width + left
-    pixel = corner.index_select(0, member) + (row * width + column).index_select(0, cell)
-    _keep_nearest(best, pixel, inverse_w, t.face.index_select(0, part.index_select(0, member)))
 
 
-def _test_rows(
-    best: Tensor,
-    t: Triangles,
-    part: Tensor,
-    low_y: Tensor,
-    high_y: Tensor,
-    resolution: tuple[int, int],
-) -> None:
-    """Fill large triangles: list their rows, in each row the pixels between the edges, and test."""
-    height, width = resolution
-    for some in part.split(max(1, _CHUNK // height)):
-        owner, step = ragged(high_y[some] - low_y[some] + 1)
-        member = some.index_select(0, owner)
-        row = low_y.index_select(0, member) + step
-        start, length = _row_spans(t, member, row, width)
-        begin = 0
-        for rows in chunks(length):
-            now = slice(begin, begin + rows)
-            _test_spans(best, t, member[now], row[now], start[now], length[now], resolution)
-            begin += rows
+def _fill(best: Tensor, found: list[_Spans]) -> None:
+    """The depth test of all pixels of spans.
+
+    Positive floats order as their bits do; below them, the inverted face index breaks ties.
+    """
+    if not found:
+        return
+    every = [torch.cat([getattr(each, f.name) for each in found]) for f in fields(_Spans)]
+    order, groups = _by_count(every[1])
+    start, _, inverse_w, slope, low = (each.index_select(0, order) for each in every)
+    for count, part in groups:
+        step = torch.arange(count, device=best.device)[:, None]
+        pixel = start[part] + step
+        at_pixel = torch.addcmul(inverse_w[part], slope[part], step.float())
+        key = torch.add(low[part], at_pixel.view(torch.int32), alpha=1 << 32)
+        best.scatter_reduce_(0, pixel.view(-1), key.view(-1), "amax")
 
 
 def chunks(counts: Int[Tensor, " n"]) -> list[int]:
@@ -334,77 +397,22 @@ def chunks(counts: Int[Tensor, " n"]) -> list[int]:
 
 def ragged(counts: Int[Tensor, " n"]) -> tuple[Int[Tensor, " total"], Int[Tensor, " total"]]:
     """For items that hold ``counts`` elements each: every element's item and its place therein."""
-    owner = torch.repeat_interleave(counts)
-    place = torch.arange(owner.numel(), device=counts.device)
-    place -= (counts.cumsum(0) - counts).index_select(0, owner)
+    ends = counts.cumsum(0)
+    total = int(ends[-1]) if len(ends) else 0
+    # Counting the items that have ended is twice as fast as ``repeat_interleave``.
+    owner = ends.new_zeros(total + 1).scatter_add_(0, ends, torch.ones_like(ends))
+    owner = owner[:total].cumsum_(0)
+    place = torch.arange(total, device=counts.device)
+    place -= (ends - counts).index_select(0, owner)
     return owner, place
-
-
-def _row_spans(t: Triangles, member: Tensor, row: Tensor, width: int) -> tuple[Tensor, Tensor]:
-    """First pixel and number of pixels that may lie in the triangle, a pixel to spare each side."""
-    x, y = t.x.index_select(1, member), t.y.index_select(1, member)
-    center_y = row.to(y.dtype) + 0.5
-    low, high = x.amin(0), x.amax(0)
-    for edge in _edges(x, y):
-        crossing = edge.mx + edge.dx * ((center_y - edge.my) / edge.dy)
-        level = edge.dy == 0
-        low = torch.where(level | edge.turned, low, torch.maximum(low, crossing))
-        high = torch.where(level | ~edge.turned, high, torch.minimum(high, crossing))
-    # An edge too long for its numbers says nothing: the whole row is tested.
-    first = torch.floor(low - 1.5).nan_to_num(nan=0.0).clamp(0, width)
-    last = torch.ceil(high + 0.5).nan_to_num(nan=width - 1).clamp(-1, width - 1)
-    return first.long(), (last - first + 1).clamp_min(0).long()
-
-
-def _test_spans(
-    best: Tensor,
-    t: Triangles,
-    member: Tensor,
-    row: Tensor,
-    start: Tensor,
-    length: Tensor,
-    resolution: tuple[int, int],
-) -> None:
-    """Test the pixels of row spans; the same arithmetic as ``_test_boxes``, pixel by pixel."""
-    height, width = resolution
-    x, y = t.x.index_select(1, member), t.y.index_select(1, member)
-    center_y = row.to(y.dtype) + 0.5
-    owner, step = ragged(length)
-    column = start.index_select(0, owner) + step
-    center_x = column.to(x.dtype) + 0.5
-    inside = torch.ones_like(owner, dtype=torch.bool)
-    for edge in _edges(x, y):
-        across = (center_y - edge.my) * edge.dx
-        along = (center_x - edge.mx.index_select(0, owner)) * edge.dy.index_select(0, owner)
-        inside &= (along >= across.index_select(0, owner)) ^ edge.turned.index_select(0, owner)
-    hit = inside.nonzero().view(-1)
-    owner, column, center_x = owner[hit], column[hit], center_x[hit]
-
-    slope_x, slope_y, first, lowest, highest = _inverse_depth_plane(t, member, x, y)
-    by_y = slope_y * (center_y - y[0]) + first
-    by_x = slope_x.index_select(0, owner) * (center_x - x[0].index_select(0, owner))
-    inverse_w = torch.clamp(
-        (by_x + by_y.index_select(0, owner)).nan_to_num_(),
-        lowest.index_select(0, owner),
-        highest.index_select(0, owner),
-    )
-    first_pixel = (t.view[member] * height + row) * width
-    pixel = first_pixel.index_select(0, owner) + column
-    _keep_nearest(best, pixel, inverse_w, t.face[member].index_select(0, owner))
-
-
-def _keep_nearest(best: Tensor, pixel: Tensor, inverse_w: Tensor, face: Tensor) -> None:
-    """Depth test. Positive floats order as their bits do; the inverted face index breaks ties."""
-    bits = inverse_w.float().view(torch.int32).long()
-    best.scatter_reduce_(0, pixel, (bits << 32) | (~face & 0xFFFFFFFF), "amax")
 
 
 def _winners(best: Tensor, shape: tuple[int, int, int], dtype: torch.dtype) -> Visible:
     """Unpack the keys; the background's, 0, is that of face -1 at infinity."""
-    low, high = best.view(torch.int32).view(-1, 2).unbind(1)  # little-endian, as all of torch is
-    face_ids = low.bitwise_not().long()
-    depth = high.contiguous().view(torch.float32).reciprocal().to(dtype)
-    pixel = best.nonzero().view(-1)
-    view = pixel // max(shape[1] * shape[2], 1)
+    high = best.view(torch.int32).view(-1, 2)[:, 1].contiguous()  # torch is little-endian
+    view, within = positions(high.view(shape[0], -1) != 0)
+    depth = high.view(torch.float32).reciprocal_().to(dtype)
+    face_ids = best.bitwise_not_().bitwise_left_shift_(32).bitwise_right_shift_(32)
+    pixel = within + view * (shape[1] * shape[2])
     face = face_ids.index_select(0, pixel)
     return Visible(face_ids.view(shape), depth.view(shape), pixel, view, face)
