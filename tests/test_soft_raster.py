@@ -25,6 +25,7 @@ from styleexp.renderers.soft_raster.geometry import (
     SumAtVertices,
     unit,
 )
+from styleexp.renderers.soft_raster.raster import Visible
 from styleexp.renderers.soft_raster.shading import InterpolateAndLight, PickOne
 
 
@@ -103,11 +104,13 @@ def test_gradcheck_smooth_light() -> None:
     points = (_random(3, 2, 5) + torch.tensor([0, 0, 1.0])[:, None, None]).requires_grad_()
     normals = (_random(3, 5, seed=1) + 0.2).requires_grad_()
     corners = torch.tensor([[0, 1, 2, 0], [1, 2, 3, 4], [2, 4, 0, 3]])
-    view = torch.tensor([0, 1, 1, 0])
-    center, lights = _random(2, 4, seed=2), _random(2, 3, 4, seed=3)
+    lights = _random(2, 2, 3, seed=3)
+    pixel, view, face = torch.tensor([[1, 5, 4, 0], [0, 1, 1, 0], [0, 1, 2, 3]])
+    nothing = torch.zeros(2, 2, 2)  # two views of 2 by 2 pixels
+    visible = Visible(nothing, nothing, pixel, view, face)
 
     def intensity(points: Tensor, normals: Tensor) -> Tensor:
-        return InterpolateAndLight.apply(points, normals, corners, view, center, lights, 0.4, 0.9)
+        return InterpolateAndLight.apply(points, normals, corners, visible, lights, 0.4, 0.9)
 
     assert ((intensity(points, normals) > 0) & (intensity(points, normals) < 1)).all()
     assert gradcheck(intensity, (points, normals))
@@ -137,17 +140,20 @@ def test_gradcheck_crossing_distance() -> None:
 
 
 def test_gradcheck_blend() -> None:
-    values = _random(2, 9).requires_grad_()
+    images, coverage = _random(2, 9).requires_grad_(), _random(9, seed=1).requires_grad_()
     # Pixel 4 is taken from all sides, more than once over.
     distance = torch.tensor([0.1, 0.15, 0.2, 0.05, 0.9], dtype=torch.float64, requires_grad=True)
     inner, outer = torch.tensor([4, 4, 4, 4, 0]), torch.tensor([1, 3, 5, 7, 1])
 
-    def blend(values: Tensor, distance: Tensor) -> Tensor:
-        outline = values[:, inner].detach()  # the gradient is then the forward's own
-        return Blend.apply(values, distance, outline, inner, outer)
+    def blend(images: Tensor, coverage: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
+        outline = images[:, inner].detach()  # the gradient is then the forward's own
+        # As is coverage's: it is 1 at the outline, and so on the inside.
+        coverage = coverage.index_fill(0, inner, 1.0)
+        return Blend.apply(images.clone(), coverage, distance, outline, inner, outer)
 
-    assert gradcheck(blend, (values, distance))
-    mixed = blend(values, distance)
+    assert gradcheck(blend, (images, coverage, distance))
+    values = torch.cat([images, coverage.index_fill(0, inner, 1.0)[None]])
+    mixed = torch.cat([each.view(-1, 9) for each in blend(images, coverage, distance)])
     assert (mixed.amax(1) <= values.amax(1)).all()
     assert (mixed.amin(1) >= values.amin(1)).all()
 
@@ -191,22 +197,19 @@ def test_same_input_same_bits(normals: str) -> None:
     assert torch.equal(first[1], second[1])
 
 
-def test_large_and_small_faces_test_pixels_alike() -> None:
-    """The two paths of the rasteriser, dense boxes and rows, agree on every pixel of a view."""
-    from styleexp.renderers.soft_raster import raster
+def test_the_same_pixels_in_any_portions() -> None:
+    """How much the rasteriser works on at once changes nothing."""
+    from styleexp.renderers.soft_raster import raster, shading
 
     vertices, faces = testing.bumpy_sphere(2)
-    arguments = (vertices, faces, testing._cameras(2), Shading(), (90, 70))
-    boxes = SoftRaster("none").render(*arguments)
+    arguments = (vertices, faces, testing._cameras(2), Shading(normals="smooth"), (90, 70))
+    whole = SoftRaster().render(*arguments)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(raster, "_BOX_SIZES", (1,))
-        rows = SoftRaster("none").render(*arguments)
         patch.setattr(raster, "_CHUNK", 500)
-        chunked = SoftRaster("none").render(*arguments)
-    for other in (rows, chunked):
-        assert torch.equal(other.face_ids, boxes.face_ids)
-        assert torch.equal(other.image, boxes.image)
-        assert torch.allclose(other.depth, boxes.depth)
+        patch.setattr(shading, "_AT_ONCE", 77)
+        chunked = SoftRaster().render(*arguments)
+    for name in ("face_ids", "depth", "image", "coverage"):
+        assert torch.equal(getattr(whole, name), getattr(chunked, name)), name
 
 
 def test_outlines_are_antialiased_and_hard_without() -> None:

@@ -299,12 +299,13 @@ class CrossingDistance(torch.autograd.Function):
 
 
 class Blend(torch.autograd.Function):
-    """Mix pixels across outlines.
+    """Mix pixels across outlines, in place.
 
-    Takes values (channels, pixels) and, of n crossings, the distances ``s`` (n), the values right
-    at the outline, on its inside (channels, n), and the inner and outer pixels (n). A pixel takes
-    the part ``|s - 0.5|`` of its neighbour; if its neighbours' parts come to more than one they are
-    scaled to one, so that a result never leaves the range of what it mixes.
+    Takes images (channels, pixels) and coverage (pixels) and, of n crossings, the distances ``s``
+    (n), the images' values right at the outline, on its inside (channels, n; coverage's is 1), and
+    the inner and outer pixels (n). A pixel takes the part ``|s - 0.5|`` of its neighbour; if its
+    neighbours' parts come to more than one they are scaled to one, so that a result never leaves
+    the range of what it mixes.
 
     What an outline sweeps over changes from the outer pixel's value to that at the outline. That,
     not the value half a pixel inside, makes the derivative by the distance: on a round object
@@ -313,33 +314,54 @@ class Blend(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, values: Tensor, distance: Tensor, outline: Tensor, inner: Tensor, outer: Tensor
-    ) -> Tensor:
+        ctx: Any,
+        images: Tensor,
+        coverage: Tensor,
+        distance: Tensor,
+        outline: Tensor,
+        inner: Tensor,
+        outer: Tensor,
+    ) -> tuple[Tensor, Tensor]:
         """Add each part of the difference to the neighbour's value."""
         shrinks = distance < 0.5
         target, source = torch.where(shrinks, inner, outer), torch.where(shrinks, outer, inner)
-        part = (distance - 0.5).abs()
-        total = part.new_zeros(values.shape[1]).index_add_(0, target, part).index_select(0, target)
+        part = (distance - 0.5).abs_()
+        total = part.new_zeros(len(coverage)).scatter_add_(0, target, part).index_select(0, target)
         scale = 1 / total.clamp_min(1)
-        before = values.index_select(1, target)
-        weight = part * scale
-        change = (values.index_select(1, source) - before) * weight
-        out = values.clone()
-        for channel, row in enumerate(change):
-            out[channel].index_add_(0, target, row)
+        weight = part.mul_(scale)
         # Where parts are scaled, more of one means less of the others.
-        moved = torch.where(total > 1, out.index_select(1, target) - before, 0.0)
-        jump = outline - values.index_select(1, outer) + torch.where(shrinks, moved, -moved)
-        ctx.save_for_backward(target, source, weight, jump * scale)
-        return out
+        shared = torch.where(total > 1, 2 * shrinks.to(scale.dtype) - 1, 0.0)
+        jumps = []
+        for row, at_outline in zip([*images, coverage], [*outline, None], strict=True):
+            before, beyond = row.index_select(0, target), row.index_select(0, outer)
+            jump = 1 - beyond if at_outline is None else at_outline - beyond
+            change = row.index_select(0, source).sub_(before).mul_(weight)
+            row.scatter_add_(0, target, change)
+            moved = row.index_select(0, target).sub_(before)
+            jumps.append(jump.addcmul_(moved, shared).mul_(scale))
+        ctx.save_for_backward(target, source, weight, *jumps)
+        ctx.mark_dirty(images, coverage)
+        ctx.set_materialize_grads(False)
+        return images, coverage
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None, None, None]:
+    def backward(
+        ctx: Any, to_images: Tensor | None, to_coverage: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
         """Values pass through to both pixels, distances feel the jump."""
-        target, source, weight, jump = ctx.saved_tensors
-        at_target = grad.index_select(1, target)
-        to_values = grad.clone()
-        for channel, row in enumerate(at_target * weight):
-            to_values[channel].index_add_(0, source, row)
-            to_values[channel].index_add_(0, target, row, alpha=-1)
-        return to_values, (at_target * jump).sum(0), None, None, None
+        target, source, weight, *jumps = ctx.saved_tensors
+        to_images, to_coverage = (
+            None if grad is None else grad.clone(memory_format=torch.contiguous_format)
+            for grad in (to_images, to_coverage)
+        )
+        rows = [None] * (len(jumps) - 1) if to_images is None else to_images.unbind()
+        to_distance = torch.zeros_like(weight)
+        for row, jump in zip([*rows, to_coverage], jumps, strict=True):
+            if row is None:
+                continue
+            at_target = row.index_select(0, target)
+            to_distance.addcmul_(at_target, jump)
+            at_target.mul_(weight)
+            row.scatter_add_(0, source, at_target)
+            row.scatter_add_(0, target, at_target.neg_())
+        return to_images, to_coverage, to_distance, None, None, None

@@ -22,7 +22,7 @@ from styleexp.renderers.soft_raster.contour import (
 )
 from styleexp.renderers.soft_raster.geometry import FaceNormals, Project, pixel_projection
 from styleexp.renderers.soft_raster.raster import candidate_pairs, facing
-from styleexp.renderers.soft_raster.shading import FlatSurface, SmoothSurface, world_light
+from styleexp.renderers.soft_raster.shading import FlatSurface, Place, SmoothSurface, world_light
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -142,24 +142,17 @@ class DeferredRenderer(Renderer):
             surface = FlatSurface(face_normals, light, shading)
         else:
             surface = SmoothSurface(points, face_normals, corners, light, shading)
-        intensities = surface.at_pixels(visible)
-        background = vertices.new_full((len(lights), visible.depth.numel()), shading.background)
-        image = background.index_copy(1, visible.pixel, intensities)
-        coverage = (visible.face_ids >= 0).to(vertices.dtype).view(-1)
+        image = Place.apply(surface.at_pixels(visible), visible, shading.background)
+        coverage = (visible.face_ids.view(-1) >= 0).to(vertices.dtype)
 
         if self.visibility_gradient == "contour" and shading.outlines:
             across = self._neighbours(faces, vertices.shape[0])
             edges = find_crossings(points, corners, across, front, pairs, visible, cameras.near)
             distance = CrossingDistance.apply(points, edges)
-            colour = surface.at_crossings(edges)
-            blended = Blend.apply(
-                torch.cat([image, coverage[None]]),
-                distance,
-                torch.cat([colour, torch.ones_like(colour[:1])]),
-                edges.inner,
-                edges.outer,
+            outline = surface.at_crossings(edges)
+            image, coverage = Blend.apply(
+                image, coverage, distance, outline, edges.inner, edges.outer
             )
-            image, coverage = blended[:-1], blended[-1]
 
         shape = visible.depth.shape
         return RenderOutput(

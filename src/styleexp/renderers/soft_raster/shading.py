@@ -5,6 +5,8 @@ The light is turned into the world once, so that normals need not be turned into
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -67,17 +69,12 @@ class SmoothSurface:
 
     def at_pixels(self, visible: Visible) -> Float[Tensor, "lights winners"]:
         """Intensities of the covered pixels."""
-        height, width = visible.face_ids.shape[1:]
-        within = visible.pixel - visible.view * (height * width)
-        row = within // width
-        column = within - row * width
         return InterpolateAndLight.apply(
             self.points,
             self.normals,
-            self.corners.index_select(1, visible.face),
-            visible.view,
-            torch.stack([column, row]).to(self.points.dtype) + 0.5,
-            self.light.index_select(1, visible.view).transpose(1, 2),
+            self.corners,
+            visible,
+            self.light,
             self.shading.albedo,
             self.shading.ambient,
         )
@@ -128,13 +125,16 @@ class InterpolateAndLight(torch.autograd.Function):
     """Interpolate vertex normals at pixels and light them, in one step.
 
     The arguments are the homogeneous pixels (3, views, V) and unit normals (3, V) of the vertices,
-    then, of n pixels, the three vertices (3, n), the view (n), the centre (2, n) and the lights
-    (lights, 3, n), and the two constants of the shading. Returns the intensities (lights, n).
+    the corners of the faces (3, F), the n covered pixels, the lights (lights, views, 3), and the
+    two constants of the shading. Returns the intensities (lights, n).
 
     The weight of a vertex is the cross product of the other two vertices' offsets from the pixel's
     ray, ``(x w - column w, y w - row w)``. That is the perspective-correct barycentric coordinate
     times a common factor, which normalising the normal removes; it needs no division by w and so
     holds for faces that reach behind the camera.
+
+    What the gradient needs is computed again: that is cheaper than memory for some twenty numbers
+    a pixel, each page of which the system would have to clear.
     """
 
     @staticmethod
@@ -143,74 +143,141 @@ class InterpolateAndLight(torch.autograd.Function):
         points: Tensor,
         normals: Tensor,
         corners: Tensor,
-        view: Tensor,
-        center: Tensor,
+        visible: Visible,
         light: Tensor,
         albedo: float,
         ambient: float,
     ) -> Tensor:
         """Weights, normal, light."""
-        views, count = points.shape[1:]
-        flat = points.reshape(3, views * count)
-        first = view * count
-        right, down, corner_normals = [], [], []
-        for corner in corners:
-            index = first + corner
-            w = flat[2].index_select(0, index)
-            right.append(flat[0].index_select(0, index).addcmul_(center[0], w, value=-1))
-            down.append(flat[1].index_select(0, index).addcmul_(center[1], w, value=-1))
-            corner_normals.append(normals.index_select(1, corner))
-        weights = [down[j] * right[k] - right[j] * down[k] for j, k in ((1, 2), (2, 0), (0, 1))]
-        normal = weights[0] * corner_normals[0]
-        for weight, corner_normal in zip(weights[1:], corner_normals[1:], strict=True):
-            normal.addcmul_(weight, corner_normal)
-        squared = (normal * normal).sum(0)
-        inverse = torch.where(squared > 0, squared, 1.0).rsqrt()
-        normal *= inverse
-        lit = (normal * light).sum(1)
-        raw = albedo * (ambient + lit)
-        unclamped = (raw >= 0) & (raw <= 1)
-        ctx.save_for_backward(
-            corners,
-            view,
-            center,
-            light,
-            normal,
-            lit,
-            torch.where(unclamped, albedo * inverse, 0.0),
-            *weights,
-            *right,
-            *down,
-            *corner_normals,
-        )
-        ctx.shapes = points.shape, normals.shape
-        return raw.clamp_(0, 1)
+        ctx.save_for_backward(points, normals, corners, light)
+        ctx.rest = visible, albedo, ambient
+        out = points.new_empty(len(light), len(visible.pixel))
+        for part in _parts(visible):
+            *_, raw = _lit_pixels(points, normals, corners, visible, light, part)
+            for row, each in zip(out[:, part], raw, strict=True):
+                torch.add(each, ambient, out=row).mul_(albedo).clamp_(0, 1)
+        return out
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         """Back through light, normalisation and weights to positions and normals."""
-        corners, view, center, light, normal, lit, scale, *rest = ctx.saved_tensors
-        weights, right, down, corner_normals = rest[:3], rest[3:6], rest[6:9], rest[9:]
-        points_shape, normals_shape = ctx.shapes
-        # Along the normal itself there is no change: normalising removes it.
-        towards = grad * scale
-        to_normal = (light * towards[:, None]).sum(0)
-        to_normal.addcmul_(normal, (lit * towards).sum(0), value=-1)
-        to_normals = grad.new_zeros(normals_shape)
-        to_points = grad.new_zeros(points_shape)
-        flat = to_points.view(3, -1)
-        to_weight = [(to_normal * corner_normal).sum(0) for corner_normal in corner_normals]
-        first = view * points_shape[2]
-        for i, corner in enumerate(corners):
-            j, k = (i + 1) % 3, (i + 2) % 3
-            share = to_normal * weights[i]
-            for axis in range(3):
-                to_normals[axis].index_add_(0, corner, share[axis])
-            # The vertex enters the weights of the other two.
-            to_right = to_weight[j] * down[k] - to_weight[k] * down[j]
-            to_down = to_weight[k] * right[j] - to_weight[j] * right[k]
-            index = first + corner
-            flat[0].index_add_(0, index, to_right)
-            flat[1].index_add_(0, index, to_down)
-            flat[2].index_add_(0, index, center[0] * to_right + center[1] * to_down, alpha=-1)
-        return to_points, to_normals, None, None, None, None, None, None
+        points, normals, corners, light = ctx.saved_tensors
+        visible, albedo, ambient = ctx.rest
+        to_points, to_normals = torch.zeros_like(points), torch.zeros_like(normals)
+        point_rows, normal_rows = to_points.view(3, -1).unbind(), to_normals.unbind()
+        for part in _parts(visible):
+            seen, lights, normal, inverse, lit = _lit_pixels(
+                points, normals, corners, visible, light, part
+            )
+            to_normal = [torch.zeros_like(inverse) for _ in range(3)]
+            along = torch.zeros_like(inverse)
+            for each, axes, towards in zip(lit, lights, grad[:, part], strict=True):
+                raw = (each + ambient).mul_(albedo)
+                towards = torch.ops.aten.hardtanh_backward(towards, raw, 0.0, 1.0)
+                along.addcmul_(towards, each)
+                for into, axis in zip(to_normal, axes, strict=True):
+                    into.addcmul_(towards, axis)
+            # Along the normal itself there is no change: normalising removes it.
+            inverse.mul_(albedo)
+            for into, axis in zip(to_normal, normal, strict=True):
+                into.addcmul_(axis, along, value=-1).mul_(inverse)
+            to_weight = [_dot(to_normal, each) for each in seen.normals]
+            for i in range(3):
+                j, k = (i + 1) % 3, (i + 2) % 3
+                for into, axis in zip(normal_rows, to_normal, strict=True):
+                    into.scatter_add_(0, seen.corners[i], axis * seen.weights[i])
+                # The vertex enters the weights of the other two.
+                to_right = _cross(to_weight[j], seen.down[k], to_weight[k], seen.down[j])
+                to_down = _cross(to_weight[k], seen.right[j], to_weight[j], seen.right[k])
+                point_rows[0].scatter_add_(0, seen.index[i], to_right)
+                point_rows[1].scatter_add_(0, seen.index[i], to_down)
+                to_w = to_right.mul_(seen.column).addcmul_(to_down, seen.row).neg_()
+                point_rows[2].scatter_add_(0, seen.index[i], to_w)
+        return to_points, to_normals, None, None, None, None, None
+
+
+_AT_ONCE = 1 << 16
+"""Pixels that are shaded at once, so that what is between fits the cache."""
+
+
+def _parts(visible: Visible) -> list[slice]:
+    return [slice(i, i + _AT_ONCE) for i in range(0, len(visible.pixel), _AT_ONCE)]
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What n pixels see: of each corner of their faces one array."""
+
+    column: Float[Tensor, " n"]
+    """Centre of the pixel."""
+    row: Float[Tensor, " n"]
+    corners: list[Int[Tensor, " n"]]
+    index: list[Int[Tensor, " n"]]
+    """Of the corner in the flattened (views, V)."""
+    right: list[Float[Tensor, " n"]]
+    """Offset from the pixel's ray."""
+    down: list[Float[Tensor, " n"]]
+    weights: list[Float[Tensor, " n"]]
+    normals: list[list[Float[Tensor, " n"]]]
+
+
+def _lit_pixels(
+    points: Tensor, normals: Tensor, corners: Tensor, visible: Visible, light: Tensor, part: slice
+) -> tuple[_Seen, list[list[Tensor]], list[Tensor], Tensor, list[Tensor]]:
+    """Of a part of the pixels: what they see, the lights' axes, the unit normal, the inverse of its
+    length before, and its product with each light."""
+    height, width = visible.face_ids.shape[1:]
+    view, face = visible.view[part], visible.face[part]
+    within = visible.pixel[part] - view * (height * width)
+    # Looked up: dividing integers takes ten times as long.
+    centers = [torch.arange(size, device=view.device).to(points) + 0.5 for size in (width, height)]
+    column = centers[0].repeat(height).index_select(0, within)
+    row = centers[1].repeat_interleave(width).index_select(0, within)
+    x, y, w = points.view(3, -1).unbind()
+    first = view * points.shape[2]
+    own = [corner.index_select(0, face) for corner in corners]
+    index = [corner + first for corner in own]
+    right, down = [], []
+    for each in index:
+        depth = w.index_select(0, each)
+        right.append(x.index_select(0, each).addcmul_(column, depth, value=-1))
+        down.append(y.index_select(0, each).addcmul_(row, depth, value=-1))
+    weights = [_cross(down[j], right[k], right[j], down[k]) for j, k in ((1, 2), (2, 0), (0, 1))]
+    at_corners = [[axis.index_select(0, each) for axis in normals] for each in own]
+    normal = [_dot(weights, each) for each in zip(*at_corners, strict=True)]
+    squared = _dot(normal, normal)
+    inverse = torch.where(squared > 0, squared, 1.0).rsqrt_()
+    for axis in normal:
+        axis.mul_(inverse)
+    lights = [[axis.index_select(0, view) for axis in each.t().contiguous()] for each in light]
+    lit = [_dot(normal, each) for each in lights]
+    seen = _Seen(column, row, own, index, right, down, weights, at_corners)
+    return seen, lights, normal, inverse, lit
+
+
+def _dot(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
+    """``a[0] b[0] + a[1] b[1] + a[2] b[2]``."""
+    return (a[0] * b[0]).addcmul_(a[1], b[1]).addcmul_(a[2], b[2])
+
+
+def _cross(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
+    """``a b - c d``."""
+    return (a * b).addcmul_(c, d, value=-1)
+
+
+class Place(torch.autograd.Function):
+    """Intensities (lights, n) of the visible pixels on a background: images (lights, pixels)."""
+
+    @staticmethod
+    def forward(ctx: Any, intensities: Tensor, visible: Visible, background: float) -> Tensor:
+        """Scatter."""
+        ctx.pixel = visible.pixel
+        image = intensities.new_full((len(intensities), visible.depth.numel()), background)
+        for row, values in zip(image, intensities, strict=True):
+            row.scatter_(0, visible.pixel, values)
+        return image
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        """Gather."""
+        return grad.index_select(1, ctx.pixel), None, None
