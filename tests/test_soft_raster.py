@@ -14,7 +14,7 @@ from styleexp.errors import UserError
 from styleexp.renderers.base import Shading
 from styleexp.renderers.soft_raster import SoftRaster
 from styleexp.renderers.soft_raster.contour import (
-    Blend,
+    Compose,
     CrossingDistance,
     Crossings,
     neighbours,
@@ -139,23 +139,29 @@ def test_gradcheck_crossing_distance() -> None:
     assert gradcheck(lambda p: CrossingDistance.apply(p, crossings), (points,))
 
 
-def test_gradcheck_blend() -> None:
-    images, coverage = _random(2, 9).requires_grad_(), _random(9, seed=1).requires_grad_()
+def test_gradcheck_compose() -> None:
+    face_ids = torch.tensor([[[0, -1, 1], [2, 3, -1], [-1, 4, 5]]])
+    pixel = (face_ids.view(-1) >= 0).nonzero().view(-1)
+    visible = Visible(face_ids, face_ids, pixel, 0 * pixel, 0 * pixel)
+    intensities = _random(2, 6).requires_grad_()
     # Pixel 4 is taken from all sides, more than once over.
     distance = torch.tensor([0.1, 0.15, 0.2, 0.05, 0.9], dtype=torch.float64, requires_grad=True)
     inner, outer = torch.tensor([4, 4, 4, 4, 0]), torch.tensor([1, 3, 5, 7, 1])
 
-    def blend(images: Tensor, coverage: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
-        outline = images[:, inner].detach()  # the gradient is then the forward's own
-        # As is coverage's: it is 1 at the outline, and so on the inside.
-        coverage = coverage.index_fill(0, inner, 1.0)
-        return Blend.apply(images.clone(), coverage, distance, outline, inner, outer)
+    def compose(intensities: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
+        # The outline's as on its inside: the gradient is then the forward's own.
+        outline = intensities[:, [3, 3, 3, 3, 0]].detach()
+        return Compose.apply(intensities, visible, 0.3, distance, outline, inner, outer)
 
-    assert gradcheck(blend, (images, coverage, distance))
-    values = torch.cat([images, coverage.index_fill(0, inner, 1.0)[None]])
-    mixed = torch.cat([each.view(-1, 9) for each in blend(images, coverage, distance)])
-    assert (mixed.amax(1) <= values.amax(1)).all()
-    assert (mixed.amin(1) >= values.amin(1)).all()
+    assert gradcheck(compose, (intensities, distance))
+    image, coverage = compose(intensities, distance)
+    assert (image.amax(1) <= intensities.amax(1).clamp_min(0.3)).all()
+    assert (image.amin(1) >= intensities.amin(1).clamp_max(0.3)).all()
+    assert (coverage >= 0).all()
+    assert (coverage <= 1).all()
+    assert gradcheck(
+        lambda i: Compose.apply(i, visible, 0.3, None, None, None, None)[0], (intensities,)
+    )
 
 
 @pytest.mark.parametrize("normals", ["flat", "smooth"])

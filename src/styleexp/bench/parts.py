@@ -156,6 +156,6 @@ STAGES = [
     ("shading", shading, "InterpolateAndLight"),
     ("outlines", deferred, "find_crossings"),
     ("outlines", deferred, "CrossingDistance"),
-    ("outlines", deferred, "Blend"),
+    ("outlines", deferred, "Compose"),
 ]
 """Of ``soft_raster``, which shades and anti-aliases only what is visible."""

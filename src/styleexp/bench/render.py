@@ -90,8 +90,8 @@ def ours(task: Task, name: str, device: torch.device) -> Contender:
         vertices.grad = None
         size = (task.resolution, task.resolution)
         out = renderer.render(vertices, faces, task.cameras, task.shading, size)
-        grey = out.image.mean(-1)
-        (grey * weights).sum().backward()
+        grey = out.image[..., 0] if out.image.shape[-1] == 1 else out.image.mean(-1)
+        grey.backward(weights)
         assert vertices.grad is not None
         return Rendered(grey.detach().cpu().numpy(), vertices.grad.cpu().numpy())
 

@@ -298,14 +298,16 @@ class CrossingDistance(torch.autograd.Function):
         return out, None
 
 
-class Blend(torch.autograd.Function):
-    """Mix pixels across outlines, in place.
+class Compose(torch.autograd.Function):
+    """Put intensities on a background and mix pixels across outlines: images and coverage.
 
-    Takes images (channels, pixels) and coverage (pixels) and, of n crossings, the distances ``s``
-    (n), the images' values right at the outline, on its inside (channels, n; coverage's is 1), and
-    the inner and outer pixels (n). A pixel takes the part ``|s - 0.5|`` of its neighbour; if its
-    neighbours' parts come to more than one they are scaled to one, so that a result never leaves
-    the range of what it mixes.
+    Takes the intensities (channels, winners) of the visible pixels, these, the background, and of n
+    crossings the distances ``s`` (n), the intensities right at the outline, on its inside
+    (channels, n), and the inner and outer pixels (n), or four times None. Returns images
+    (channels, pixels) and coverage (pixels).
+
+    A pixel takes the part ``|s - 0.5|`` of its neighbour; if its neighbours' parts come to more
+    than one they are scaled to one, so that a result never leaves the range of what it mixes.
 
     What an outline sweeps over changes from the outer pixel's value to that at the outline. That,
     not the value half a pixel inside, makes the derivative by the distance: on a round object
@@ -315,14 +317,25 @@ class Blend(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        images: Tensor,
-        coverage: Tensor,
-        distance: Tensor,
-        outline: Tensor,
-        inner: Tensor,
-        outer: Tensor,
+        intensities: Tensor,
+        visible: Visible,
+        background: float,
+        distance: Tensor | None,
+        outline: Tensor | None,
+        inner: Tensor | None,
+        outer: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
         """Add each part of the difference to the neighbour's value."""
+        image = intensities.new_full((len(intensities), visible.depth.numel()), background)
+        for row, values in zip(image, intensities, strict=True):
+            row.scatter_(0, visible.pixel, values)
+        coverage = (visible.face_ids.view(-1) >= 0).to(image.dtype)
+        ctx.pixel = visible.pixel
+        ctx.set_materialize_grads(False)
+        if distance is None or outline is None or inner is None or outer is None:
+            ctx.mark_non_differentiable(coverage)
+            ctx.save_for_backward()
+            return image, coverage
         shrinks = distance < 0.5
         target, source = torch.where(shrinks, inner, outer), torch.where(shrinks, outer, inner)
         part = (distance - 0.5).abs_()
@@ -332,36 +345,40 @@ class Blend(torch.autograd.Function):
         # Where parts are scaled, more of one means less of the others.
         shared = torch.where(total > 1, 2 * shrinks.to(scale.dtype) - 1, 0.0)
         jumps = []
-        for row, at_outline in zip([*images, coverage], [*outline, None], strict=True):
-            before, beyond = row.index_select(0, target), row.index_select(0, outer)
-            jump = 1 - beyond if at_outline is None else at_outline - beyond
+        for row, at_outline in zip(
+            [*image, coverage], [*outline, torch.ones_like(weight)], strict=True
+        ):
+            before = row.index_select(0, target)
+            jump = at_outline - row.index_select(0, outer)
             change = row.index_select(0, source).sub_(before).mul_(weight)
             row.scatter_add_(0, target, change)
             moved = row.index_select(0, target).sub_(before)
             jumps.append(jump.addcmul_(moved, shared).mul_(scale))
         ctx.save_for_backward(target, source, weight, *jumps)
-        ctx.mark_dirty(images, coverage)
-        ctx.set_materialize_grads(False)
-        return images, coverage
+        return image, coverage
 
     @staticmethod
     def backward(
-        ctx: Any, to_images: Tensor | None, to_coverage: Tensor | None
+        ctx: Any, to_image: Tensor | None, to_coverage: Tensor | None
     ) -> tuple[Tensor | None, ...]:
         """Values pass through to both pixels, distances feel the jump."""
+        nothing = (None,) * 4
+        if not ctx.saved_tensors:
+            given = None if to_image is None else to_image.index_select(1, ctx.pixel)
+            return given, None, None, *nothing
         target, source, weight, *jumps = ctx.saved_tensors
-        to_images, to_coverage = (
-            None if grad is None else grad.clone(memory_format=torch.contiguous_format)
-            for grad in (to_images, to_coverage)
-        )
-        rows = [None] * (len(jumps) - 1) if to_images is None else to_images.unbind()
+        rows = [None] * (len(jumps) - 1) if to_image is None else list(to_image)
         to_distance = torch.zeros_like(weight)
-        for row, jump in zip([*rows, to_coverage], jumps, strict=True):
+        to_intensities = None
+        if to_image is not None:
+            to_intensities = to_image.new_empty(len(to_image), len(ctx.pixel))
+        for i, (row, jump) in enumerate(zip([*rows, to_coverage], jumps, strict=True)):
             if row is None:
                 continue
             at_target = row.index_select(0, target)
             to_distance.addcmul_(at_target, jump)
-            at_target.mul_(weight)
-            row.scatter_add_(0, source, at_target)
-            row.scatter_add_(0, target, at_target.neg_())
-        return to_images, to_coverage, to_distance, None, None, None
+            if to_intensities is not None and i < len(rows):
+                moved = at_target.mul_(weight)
+                row = row.clone().scatter_add_(0, source, moved).scatter_add_(0, target, -moved)
+                torch.index_select(row, 0, ctx.pixel, out=to_intensities[i])
+        return to_intensities, None, None, to_distance, None, None, None

@@ -15,14 +15,14 @@ import torch
 from styleexp.errors import unknown_name
 from styleexp.renderers.base import Cameras, Capabilities, Renderer, RenderOutput, Shading
 from styleexp.renderers.soft_raster.contour import (
-    Blend,
+    Compose,
     CrossingDistance,
     find_crossings,
     neighbours,
 )
 from styleexp.renderers.soft_raster.geometry import FaceNormals, Project, pixel_projection
 from styleexp.renderers.soft_raster.raster import candidate_pairs, facing
-from styleexp.renderers.soft_raster.shading import FlatSurface, Place, SmoothSurface, world_light
+from styleexp.renderers.soft_raster.shading import FlatSurface, SmoothSurface, world_light
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -142,17 +142,16 @@ class DeferredRenderer(Renderer):
             surface = FlatSurface(face_normals, light, shading)
         else:
             surface = SmoothSurface(points, face_normals, corners, light, shading)
-        image = Place.apply(surface.at_pixels(visible), visible, shading.background)
-        coverage = (visible.face_ids.view(-1) >= 0).to(vertices.dtype)
-
+        intensities = surface.at_pixels(visible)
+        outlines = None
         if self.visibility_gradient == "contour" and shading.outlines:
             across = self._neighbours(faces, vertices.shape[0])
             edges = find_crossings(points, corners, across, front, pairs, visible, cameras.near)
             distance = CrossingDistance.apply(points, edges)
-            outline = surface.at_crossings(edges)
-            image, coverage = Blend.apply(
-                image, coverage, distance, outline, edges.inner, edges.outer
-            )
+            outlines = distance, surface.at_crossings(edges), edges.inner, edges.outer
+        image, coverage = Compose.apply(
+            intensities, visible, shading.background, *(outlines or [None] * 4)
+        )
 
         shape = visible.depth.shape
         return RenderOutput(

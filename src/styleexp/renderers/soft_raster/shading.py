@@ -263,21 +263,3 @@ def _dot(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
 def _cross(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
     """``a b - c d``."""
     return (a * b).addcmul_(c, d, value=-1)
-
-
-class Place(torch.autograd.Function):
-    """Intensities (lights, n) of the visible pixels on a background: images (lights, pixels)."""
-
-    @staticmethod
-    def forward(ctx: Any, intensities: Tensor, visible: Visible, background: float) -> Tensor:
-        """Scatter."""
-        ctx.pixel = visible.pixel
-        image = intensities.new_full((len(intensities), visible.depth.numel()), background)
-        for row, values in zip(image, intensities, strict=True):
-            row.scatter_(0, visible.pixel, values)
-        return image
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-        """Gather."""
-        return grad.index_select(1, ctx.pixel), None, None
