@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from styleexp.renderers.soft_raster.raster import chunks, ragged
+from styleexp.renderers.soft_raster.raster import chunks, positions, ragged, true_indices
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -79,17 +79,15 @@ class _Segments:
     """The parts of edges in front of the near plane, m of them, and the scan lines they meet."""
 
     p: Float[Tensor, "3 m"]
-    """One end in pixels, and 1/w there; the other end is ``q``."""
+    """One end in pixels, along and across the lines, and 1/w there; the other end is ``q``."""
     q: Float[Tensor, "3 m"]
     view: Int[Tensor, " m"]
     face: Int[Tensor, " m"]
     start: Int[Tensor, " m"]
     end: Int[Tensor, " m"]
-    along_row: Bool[Tensor, " m"]
-    """Whether the scan lines are rows (or else columns); every edge is there once with either."""
     preferred: Bool[Tensor, " m"]
     """Whether the scan lines are those that cross the edge at the greater angle."""
-    first: Int[Tensor, " m"]
+    first: Float[Tensor, " m"]
     """First scan line whose pixel centres it passes between."""
     count: Int[Tensor, " m"]
     """How many scan lines there are."""
@@ -106,20 +104,23 @@ def find_crossings(
     near: float,
 ) -> Crossings:
     """All places where a visible contour edge separates two pixels."""
-    edges = _contour_edges(points, corners, across, front, pairs)
-    segments = _segments(points, edges, near, visible.depth)
+    edges = _contour_edges(points, corners, across, front, pairs.chosen)
     found: list[_Found] = []
-    begin = held = 0
-    for size in chunks(segments.count):
-        part = _part(segments, slice(begin, begin + size))
-        found.append(_seen_crossings(part, visible.depth))
-        begin += size
-        held += len(found[-1][1])
-        if held > MOST_CROSSINGS:  # many faces in one place would otherwise fill the memory
-            found = [_outermost_of(found)]
-            held = len(found[0][1])
+    held = 0
+    # An edge competes for being the outermost along both, though only one will be used.
+    for along_row in (True, False):
+        segments = _segments(points, edges, near, visible.depth, along_row)
+        begin = 0
+        for size in chunks(segments.count):
+            part = _part(segments, slice(begin, begin + size))
+            found.append(_seen_crossings(part, visible.depth, along_row))
+            begin += size
+            held += len(found[-1][1])
+            if held > MOST_CROSSINGS:  # many faces in one place would otherwise fill the memory
+                found = [_outermost_of(found)]
+                held = len(found[0][1])
     crossings, _, preferred = _outermost_of(found)
-    return _part(crossings, preferred.nonzero().view(-1))
+    return _part(crossings, true_indices(preferred))
 
 
 def _outermost_of(found: list[_Found]) -> _Found:
@@ -138,17 +139,13 @@ def _part(record: Any, index: slice | Tensor) -> Any:
 
 
 def _contour_edges(
-    points: Tensor, corners: Tensor, across: Tensor, front: Tensor, pairs: FacePairs
+    points: Tensor, corners: Tensor, across: Tensor, front: Tensor, chosen: Tensor
 ) -> tuple[Tensor, ...]:
     """View, face, and start and end in (views, vertices) of the edges that front faces end at."""
-    views, number = front.shape
-    known = torch.cat([front, front.new_zeros(views, 1)], dim=1).view(-1)
-    first = pairs.view * (number + 1)
+    away = torch.cat([~front, front.new_ones(len(front), 1)], dim=1)
     found = []
     for k in range(3):
-        beyond = first + across[k].index_select(0, pairs.face)
-        edge = (~known.index_select(0, beyond)).nonzero().view(-1)
-        view, face = pairs.view[edge], pairs.face[edge]
+        view, face = positions(away.index_select(1, across[k]).logical_and_(chosen))
         base = view * points.shape[2]
         start = base + corners[k].index_select(0, face)
         end = base + corners[(k + 1) % 3].index_select(0, face)
@@ -156,88 +153,83 @@ def _contour_edges(
     return tuple(torch.cat(parts) for parts in zip(*found, strict=True))
 
 
-def _segments(points: Tensor, edges: tuple[Tensor, ...], near: float, depth: Tensor) -> _Segments:
-    """Cut edges at the near plane, project them and choose their scan lines."""
-    start, end = edges[2:]
-    height, width = depth.shape[1:]
+def _segments(
+    points: Tensor, edges: tuple[Tensor, ...], near: float, depth: Tensor, along_row: bool
+) -> _Segments:
+    """Cut edges at the near plane, project them and find the rows or columns that they meet."""
+    view, face, start, end = edges
     flat = points.reshape(3, -1)
     a, b = flat.index_select(1, start), flat.index_select(1, end)
     rise = b[2] - a[2]
     cut = a + ((near - a[2]) / torch.where(rise == 0, 1.0, rise)) * (b - a)
     a_front, b_front = a[2] >= near, b[2] >= near
-    p, q = torch.where(a_front, a, cut), torch.where(b_front, b, cut)
-    p, q = [
-        torch.cat([end[:2], torch.ones_like(end[2:])]) / end[2].clamp_min(near) for end in (p, q)
-    ]
-    steep = (q[1] - p[1]).abs() >= (q[0] - p[0]).abs()
-
-    # An edge competes for being the outermost along both, though only one will be used.
-    along_row = torch.cat([torch.ones_like(steep), torch.zeros_like(steep)])
-    preferred = torch.cat([steep, ~steep])
-    p, q, ahead = p.repeat(1, 2), q.repeat(1, 2), (a_front | b_front).repeat(2)
-    view, face, start, end = (edge.repeat(2) for edge in edges)
-    from_p, from_q = torch.where(along_row, p[1], p[0]), torch.where(along_row, q[1], q[0])
-    lines = torch.where(along_row, height, width)
-    first = torch.ceil(torch.minimum(from_p, from_q) - 0.5).clamp_min(0)
-    beyond = torch.minimum(torch.ceil(torch.maximum(from_p, from_q) - 0.5), lines)
-    count = torch.where(ahead, beyond - first, 0.0).nan_to_num(nan=0.0).clamp_min(0)
-    return _Segments(p, q, view, face, start, end, along_row, preferred, first.long(), count.long())
+    order = [0, 1] if along_row else [1, 0]
+    p, q = (
+        torch.stack([end[order[0]], end[order[1]], torch.ones_like(rise)]) / end[2].clamp_min(near)
+        for end in (torch.where(a_front, a, cut), torch.where(b_front, b, cut))
+    )
+    across, along = (q[1] - p[1]).abs(), (q[0] - p[0]).abs()
+    preferred = across >= along if along_row else across > along
+    first = torch.ceil(torch.minimum(p[1], q[1]) - 0.5).clamp_min(0)
+    beyond = torch.ceil(torch.maximum(p[1], q[1]) - 0.5).clamp_max(depth.shape[1 if along_row else 2])
+    count = torch.where(a_front | b_front, beyond - first, 0.0).nan_to_num(nan=0.0).clamp_min(0)
+    first = first.nan_to_num(nan=0.0)
+    return _Segments(p, q, view, face, start, end, preferred, first, count.long())
 
 
-def _seen_crossings(segments: _Segments, depth: Tensor) -> tuple[Crossings, Tensor, Tensor]:
+def _seen_crossings(
+    segments: _Segments, depth: Tensor, along_row: bool
+) -> tuple[Crossings, Tensor, Tensor]:
     """Where segments pass between two pixels, in front of the farther; ``s``, and ``preferred``."""
     height, width = depth.shape[1:]
+    # From pixel to pixel on a line, from line to line, and where the last pair's first pixel is.
+    next_pixel, next_line = (1, width) if along_row else (width, 1)
+    last = (width if along_row else height) - 2
     owner, step = ragged(segments.count)
-    p, q = segments.p.index_select(1, owner), segments.q.index_select(1, owner)
-    along_row = segments.along_row.index_select(0, owner)
+    p_along, p_across, p_inverse_w = (row.index_select(0, owner) for row in segments.p)
+    q_along, q_across, q_inverse_w = (row.index_select(0, owner) for row in segments.q)
     line = segments.first.index_select(0, owner) + step
-    # u runs along the scan line, v across it.
-    p_u, p_v = torch.where(along_row, p[0], p[1]), torch.where(along_row, p[1], p[0])
-    q_u, q_v = torch.where(along_row, q[0], q[1]), torch.where(along_row, q[1], q[0])
-    share = ((line.to(p.dtype) + 0.5 - p_v) / (q_v - p_v)).clamp(0, 1)
-    crossing = torch.lerp(p_u, q_u, share)
-    inverse_w = torch.lerp(p[2], q[2], share)
+    share = ((line + 0.5).sub_(p_across) / q_across.sub_(p_across)).clamp_(0, 1)
+    crossing = torch.lerp(p_along, q_along, share)
+    inverse_w = torch.lerp(p_inverse_w, q_inverse_w, share)
 
     # The pair's first pixel is left of, or above, the crossing.
     before = torch.floor(crossing - 0.5)
-    in_frame = (before >= 0) & (before < torch.where(along_row, width, height) - 1)
-    before = torch.where(in_frame, before, 0.0)
-    fraction = crossing - before - 0.5
+    in_frame = (before >= 0) & (before <= last)
+    before = before.nan_to_num_(nan=0.0).clamp_(0, max(last, 0))
+    fraction = crossing.sub_(before).sub_(0.5)
     # A front face is to the right of its edges that go down, below those that go left.
-    inner_last = (q_v > p_v) == along_row
-    distance = torch.where(inner_last, 1 - fraction, fraction)
+    inner_last = (segments.q[1] > segments.p[1]) == along_row
+    shift = (inner_last * next_pixel).index_select(0, owner)
+    is_last = inner_last.to(fraction.dtype).index_select(0, owner)
+    distance = torch.addcmul(is_last, 1 - 2 * is_last, fraction)
 
-    column = torch.where(along_row, before.long(), line)
-    row = torch.where(along_row, line, before.long())
-    pixel = (segments.view.index_select(0, owner) * height + row) * width + column
-    following = pixel + torch.where(along_row, 1, width)
-    inner = torch.where(inner_last, following, pixel)
-    outer = torch.where(inner_last, pixel, following)
+    begun = segments.view * (height * width) + segments.first.long() * next_line
+    pixel = step.mul_(next_line).add_(begun.index_select(0, owner))
+    pixel.add_(before.long(), alpha=next_pixel)
+    inner, outer = pixel + shift, pixel.add_(next_pixel).sub_(shift)
     flat = depth.reshape(-1)
     last_pixel = max(flat.numel() - 1, 0)
     inner_depth = flat.index_select(0, inner.clamp_max(last_pixel))
     outer_depth = flat.index_select(0, outer.clamp_max(last_pixel))
     seen = in_frame & (inner_depth < outer_depth) & (inverse_w * outer_depth > 1)
 
-    kept = seen.nonzero().view(-1)
-    shift = inner_last.to(p.dtype)
+    kept = true_indices(seen)
+    owner, is_last = owner.index_select(0, kept), is_last.index_select(0, kept)
+    along = before.index_select(0, kept).add_(is_last).add_(0.5)
+    across = line.index_select(0, kept).add_(0.5)
     crossings = Crossings(
-        inner[kept],
-        outer[kept],
-        segments.start[owner[kept]],
-        segments.end[owner[kept]],
-        torch.stack(
-            [
-                column[kept] + torch.where(along_row, shift, 0.0)[kept] + 0.5,
-                row[kept] + torch.where(along_row, 0.0, shift)[kept] + 0.5,
-            ]
-        ),
-        along_row[kept],
-        1 - 2 * shift[kept],
-        segments.view[owner[kept]],
-        segments.face[owner[kept]],
+        inner.index_select(0, kept),
+        outer.index_select(0, kept),
+        segments.start.index_select(0, owner),
+        segments.end.index_select(0, owner),
+        torch.stack([along, across] if along_row else [across, along]),
+        seen.new_full((len(kept),), along_row),
+        1 - 2 * is_last,
+        segments.view.index_select(0, owner),
+        segments.face.index_select(0, owner),
     )
-    return crossings, distance[kept], segments.preferred[owner[kept]]
+    return crossings, distance.index_select(0, kept), segments.preferred.index_select(0, owner)
 
 
 def _outermost(crossings: Crossings, distance: Tensor) -> Int[Tensor, " pixel_pairs"]:

@@ -132,9 +132,6 @@ class InterpolateAndLight(torch.autograd.Function):
     ray, ``(x w - column w, y w - row w)``. That is the perspective-correct barycentric coordinate
     times a common factor, which normalising the normal removes; it needs no division by w and so
     holds for faces that reach behind the camera.
-
-    What the gradient needs is computed again: that is cheaper than memory for some twenty numbers
-    a pixel, each page of which the system would have to clear.
     """
 
     @staticmethod
@@ -149,11 +146,15 @@ class InterpolateAndLight(torch.autograd.Function):
         ambient: float,
     ) -> Tensor:
         """Weights, normal, light."""
-        ctx.save_for_backward(points, normals, corners, light)
+        ctx.shapes = points.shape, normals.shape
         ctx.rest = visible, albedo, ambient
+        ctx.known = []
         out = points.new_empty(len(light), len(visible.pixel))
         for part in _parts(visible):
-            *_, raw = _lit_pixels(points, normals, corners, visible, light, part)
+            known = _lit_pixels(points, normals, corners, visible, light, part)
+            if any(ctx.needs_input_grad):
+                ctx.known.append(known)
+            *_, raw = known
             for row, each in zip(out[:, part], raw, strict=True):
                 torch.add(each, ambient, out=row).mul_(albedo).clamp_(0, 1)
         return out
@@ -161,14 +162,11 @@ class InterpolateAndLight(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         """Back through light, normalisation and weights to positions and normals."""
-        points, normals, corners, light = ctx.saved_tensors
         visible, albedo, ambient = ctx.rest
-        to_points, to_normals = torch.zeros_like(points), torch.zeros_like(normals)
+        to_points, to_normals = (grad.new_zeros(shape) for shape in ctx.shapes)
         point_rows, normal_rows = to_points.view(3, -1).unbind(), to_normals.unbind()
-        for part in _parts(visible):
-            seen, lights, normal, inverse, lit = _lit_pixels(
-                points, normals, corners, visible, light, part
-            )
+        for part, known in zip(_parts(visible), ctx.known, strict=True):
+            seen, lights, normal, inverse, lit = known
             to_normal = [torch.zeros_like(inverse) for _ in range(3)]
             along = torch.zeros_like(inverse)
             for each, axes, towards in zip(lit, lights, grad[:, part], strict=True):
@@ -178,7 +176,7 @@ class InterpolateAndLight(torch.autograd.Function):
                 for into, axis in zip(to_normal, axes, strict=True):
                     into.addcmul_(towards, axis)
             # Along the normal itself there is no change: normalising removes it.
-            inverse.mul_(albedo)
+            inverse = inverse * albedo
             for into, axis in zip(to_normal, normal, strict=True):
                 into.addcmul_(axis, along, value=-1).mul_(inverse)
             to_weight = [_dot(to_normal, each) for each in seen.normals]
@@ -196,7 +194,7 @@ class InterpolateAndLight(torch.autograd.Function):
         return to_points, to_normals, None, None, None, None, None
 
 
-_AT_ONCE = 1 << 16
+_AT_ONCE = 1 << 15
 """Pixels that are shaded at once, so that what is between fits the cache."""
 
 
