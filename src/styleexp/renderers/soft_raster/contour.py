@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from styleexp.renderers.soft_raster.raster import chunks, positions, ragged, true_indices
+from styleexp.renderers.soft_raster.raster import chunks, positions, ragged, take, true_indices
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -145,7 +145,7 @@ def _contour_edges(
     away = torch.cat([~front, front.new_ones(len(front), 1)], dim=1)
     found = []
     for k in range(3):
-        view, face = positions(away.index_select(1, across[k]).logical_and_(chosen))
+        view, face = positions(take(away, across[k]).logical_and_(chosen))
         base = view * points.shape[2]
         start = base + corners[k].index_select(0, face)
         end = base + corners[(k + 1) % 3].index_select(0, face)

@@ -10,6 +10,7 @@ side given by the top-left rule.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
@@ -43,11 +44,11 @@ class FacePairs:
 
 @dataclass(frozen=True)
 class Triangles:
-    """Triangles in pixel coordinates, one row of each array per corner."""
+    """Triangles in pixel coordinates, one array per corner."""
 
-    x: Float[Tensor, "3 triangles"]
-    y: Float[Tensor, "3 triangles"]
-    inverse_w: Float[Tensor, "3 triangles"]
+    x: Sequence[Float[Tensor, " triangles"]]
+    y: Sequence[Float[Tensor, " triangles"]]
+    inverse_w: Sequence[Float[Tensor, " triangles"]]
     view: Int[Tensor, " triangles"]
     face: Int[Tensor, " triangles"]
 
@@ -98,11 +99,20 @@ def candidate_pairs(
     outside |= (y > height * w).byte() << 3
     outside |= (w < near).byte() << 4
 
-    a, b, c = (outside.index_select(1, corner) for corner in corners)
-    chosen = ((a & b & c) == 0).logical_and_(front)
+    chosen = front
+    if outside.any():
+        a, b, c = (take(outside, corner) for corner in corners)
+        chosen = ((a & b & c) == 0).logical_and_(front)
     view, face = positions(chosen)
-    crosses = (((a | b | c) & 16) != 0).view(-1)[view * front.shape[1] + face]
+    crosses = torch.zeros_like(face, dtype=torch.bool)
+    if (outside >= 16).any():
+        crosses = (((a | b | c) & 16) != 0).view(-1)[view * front.shape[1] + face]
     return FacePairs(view, face, crosses, chosen)
+
+
+def take(rows: Tensor, columns: Int[Tensor, " n"]) -> Tensor:
+    """``rows[:, columns]``; of bytes, a row at a time is three times as fast."""
+    return torch.stack([row.index_select(0, columns) for row in rows])
 
 
 def positions(mask: Bool[Tensor, "rows columns"]) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
@@ -152,13 +162,14 @@ def _triangles(points: Tensor, corners: Tensor, pairs: FacePairs, near: float) -
     """Project the pairs to the image, clipping those that cross the near plane."""
     views, count = points.shape[1:]
     flat = points.reshape(3, views * count)
-    index = [pairs.view * count + corner.index_select(0, pairs.face) for corner in corners]
+    first = pairs.view * count
+    index = [corner.index_select(0, pairs.face).add_(first) for corner in corners]
     inverse = 1 / flat[2]
     x, y = flat[0] * inverse, flat[1] * inverse
     whole = Triangles(
-        torch.stack([x.index_select(0, i) for i in index]),
-        torch.stack([y.index_select(0, i) for i in index]),
-        torch.stack([inverse.index_select(0, i) for i in index]),
+        [x.index_select(0, i) for i in index],
+        [y.index_select(0, i) for i in index],
+        [inverse.index_select(0, i) for i in index],
         pairs.view,
         pairs.face,
     )
@@ -170,9 +181,10 @@ def _triangles(points: Tensor, corners: Tensor, pairs: FacePairs, near: float) -
     homogeneous = torch.stack([flat.index_select(1, i[crossing]) for i in index])
     clipped = _clip(homogeneous, near)
     return Triangles(
-        x=torch.cat([whole.x[:, rest], clipped[0]], dim=1),
-        y=torch.cat([whole.y[:, rest], clipped[1]], dim=1),
-        inverse_w=torch.cat([whole.inverse_w[:, rest], clipped[2]], dim=1),
+        *(
+            [torch.cat([row[rest], cut]) for row, cut in zip(rows, parts, strict=True)]
+            for rows, parts in zip((whole.x, whole.y, whole.inverse_w), clipped, strict=True)
+        ),
         view=torch.cat([pairs.view[rest], view, view]),
         face=torch.cat([pairs.face[rest], face, face]),
     )
@@ -221,11 +233,12 @@ def _rows(
     has a corner that is not a number.
     """
     height, width = resolution
-    first = torch.ceil(t.y.amin(0) - 0.5).clamp_(0, height)
-    count = torch.ceil(t.y.amax(0) - 0.5).clamp_(0, height) - first
+    top, bottom = _range(t.y)
+    first = top.sub_(0.5).ceil_().clamp_(0, height)
+    count = bottom.sub_(0.5).ceil_().clamp_(0, height).sub_(first)
     # Rounding may move where an edge crosses a row: left out is what is clearly between columns.
-    left = torch.ceil(t.x.amin(0) - 0.51).clamp_(0, width)
-    right = torch.ceil(t.x.amax(0) - 0.49).clamp_(0, width)
+    left, right = _range(t.x)
+    left, right = left.sub_(0.51).ceil_().clamp_(0, width), right.sub_(0.49).ceil_().clamp_(0, width)
     return first, count.mul_(right > left).nan_to_num_(nan=0.0).to(torch.int32)
 
 
@@ -237,7 +250,8 @@ def _by_count(counts: Int[Tensor, " n"]) -> tuple[Int[Tensor, " m"], list[tuple[
     """
     if counts.device.type == "cpu":  # numpy sorts short integers by their digits
         most = int(counts.max()) if len(counts) else 0
-        short = counts.to(torch.int16 if most < 1 << 15 else torch.int32)
+        kind = torch.uint8 if most < 1 << 8 else torch.int16 if most < 1 << 15 else torch.int32
+        short = counts.to(kind)
         order = torch.from_numpy(np.argsort(short.numpy(), kind="stable"))
     else:
         order = counts.argsort(stable=True)
@@ -321,9 +335,13 @@ def _set_up(
         q[0],
         slope_x,
         slope_y,
-        torch.minimum(torch.minimum(q[0], q[1]), q[2]),
-        torch.maximum(torch.maximum(q[0], q[1]), q[2]),
+        *_range(q),
     )
+
+
+def _range(corners: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    a, b, c = corners
+    return torch.minimum(torch.minimum(a, b), c), torch.maximum(torch.maximum(a, b), c)
 
 
 @dataclass(frozen=True)
