@@ -104,7 +104,7 @@ def test_gradcheck_smooth_light() -> None:
     points = (_random(3, 2, 5) + torch.tensor([0, 0, 1.0])[:, None, None]).requires_grad_()
     normals = (_random(3, 5, seed=1) + 0.2).requires_grad_()
     corners = torch.tensor([[0, 1, 2, 0], [1, 2, 3, 4], [2, 4, 0, 3]])
-    lights = _random(2, 2, 3, seed=3)
+    lights = 0.3 * _random(2, 2, 3, seed=3)
     pixel, view, face = torch.tensor([[1, 5, 4, 0], [0, 1, 1, 0], [0, 1, 2, 3]])
     nothing = torch.zeros(2, 2, 2)  # two views of 2 by 2 pixels
     visible = Visible(nothing, nothing, pixel, view, face)

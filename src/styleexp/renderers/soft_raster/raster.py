@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 _CHUNK = 1 << 18
 """About how many rows of triangles, or pixels of rows, are worked on at once: bounds memory."""
+_AT_ONCE = 1 << 16
+"""Triangles whose spans are looked for at once, so that what is between fits the cache."""
 _FAR = 1e30
 """Added to where an edge crosses a row, it takes the edge out of a maximum or minimum."""
 
@@ -112,17 +114,24 @@ def candidate_pairs(
 
 def take(rows: Tensor, columns: Int[Tensor, " n"]) -> Tensor:
     """``rows[:, columns]``; of bytes, a row at a time is three times as fast."""
-    return torch.stack([row.index_select(0, columns) for row in rows])
+    taken = rows.new_empty(len(rows), len(columns))
+    for row, into in zip(rows, taken, strict=True):
+        torch.index_select(row, 0, columns, out=into)
+    return taken
 
 
 def positions(mask: Bool[Tensor, "rows columns"]) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
     """Row and column of what is true, in order."""
     place = true_indices(mask.reshape(-1))
-    rows, columns = mask.shape
-    ends = torch.searchsorted(place, torch.arange(1, rows + 1, device=mask.device) * columns)
+    row = _rows_of(place, *mask.shape)
+    return row, torch.sub(place, row, alpha=mask.shape[1])
+
+
+def _rows_of(place: Int[Tensor, " n"], rows: int, columns: int) -> Int[Tensor, " n"]:
+    """The rows of places, given in order, in a flattened array. Division would take longer."""
+    ends = torch.searchsorted(place, torch.arange(1, rows + 1, device=place.device) * columns)
     counts = ends.diff(prepend=ends.new_zeros(1))
-    row = torch.repeat_interleave(counts, output_size=len(place))
-    return row, place - row * columns
+    return torch.repeat_interleave(counts, output_size=len(place))
 
 
 def true_indices(mask: Bool[Tensor, " n"]) -> Int[Tensor, " true"]:
@@ -145,16 +154,17 @@ def rasterise(
     best = torch.zeros(views * height * width, dtype=torch.int64, device=points.device)
     triangles = _triangles(points, corners, pairs, near)
     first, rows = _rows(triangles, resolution)
-    order, groups = _by_count(rows)
-    setup = _set_up(triangles, first, order, resolution)
-    found, held = [], 0
-    for count, part in groups:
-        found.append(_spans(setup, part, count, width))
-        held += len(found[-1].start)
-        if held > _CHUNK:
-            _fill(best, found)
-            found, held = [], 0
-    _fill(best, found)
+    for begin in range(0, len(rows), _AT_ONCE):
+        order, groups = _by_count(rows[begin : begin + _AT_ONCE])
+        setup = _set_up(triangles, first, order.add_(begin), resolution)
+        found, held = [], 0
+        for count, part in groups:
+            found.append(_spans(setup, part, count, width))
+            held += len(found[-1].start)
+            if held > _CHUNK:
+                _fill(best, found)
+                found, held = [], 0
+        _fill(best, found)
     return _winners(best, (views, height, width), points.dtype)
 
 
@@ -428,9 +438,9 @@ def ragged(counts: Int[Tensor, " n"]) -> tuple[Int[Tensor, " total"], Int[Tensor
 def _winners(best: Tensor, shape: tuple[int, int, int], dtype: torch.dtype) -> Visible:
     """Unpack the keys; the background's, 0, is that of face -1 at infinity."""
     high = best.view(torch.int32).view(-1, 2)[:, 1].contiguous()  # torch is little-endian
-    view, within = positions(high.view(shape[0], -1) != 0)
+    pixel = true_indices(high != 0)
+    view = _rows_of(pixel, shape[0], shape[1] * shape[2])
     depth = high.view(torch.float32).reciprocal_().to(dtype)
     face_ids = best.bitwise_not_().bitwise_left_shift_(32).bitwise_right_shift_(32)
-    pixel = within + view * (shape[1] * shape[2])
     face = face_ids.index_select(0, pixel)
     return Visible(face_ids.view(shape), depth.view(shape), pixel, view, face)
