@@ -16,7 +16,6 @@ from styleexp.bench.measuring import Times, interleaved, peak_memory_mb, ratio
 from styleexp.bench.parts import STAGES, Parts, timed_stages
 from styleexp.plugins import build, find
 from styleexp.renderers.base import Shading
-from styleexp.renderers.soft_raster import raster
 from styleexp.views import orbit
 
 if TYPE_CHECKING:
@@ -133,7 +132,7 @@ def measure(task: Task, names: Sequence[str], device: torch.device, repeats: int
         else:
             row.setdefault("peers", []).append(told)
     if first == "soft_raster":
-        row |= {"candidates": count_candidates(task), "parts_cpu_ms": parts(task, device, repeats)}
+        row["parts_cpu_ms"] = parts(task, device, repeats)
     return row
 
 
@@ -168,30 +167,6 @@ def parts(task: Task, device: torch.device, repeats: int) -> dict[str, float]:
     names = {name for row in rows for name in row}
     medians = {n: float(np.median([row[n][1] if n in row else 0.0 for row in rows])) for n in names}
     return {name: 1e3 * medians[name] for name in sorted(medians, key=lambda n: -medians[n])}
-
-
-def count_candidates(task: Task) -> int:
-    """Pairs of a face and a pixel centre that the rasteriser tests."""
-    found = 0
-    boxes, spans = raster._test_boxes, raster._test_spans
-
-    def count_boxes(*given: Any) -> None:
-        nonlocal found
-        part, size, frame = given[2], given[5], given[6]
-        found += part.numel() * min(size, frame[0]) * min(size, frame[1])
-        boxes(*given)
-
-    def count_spans(*given: Any) -> None:
-        nonlocal found
-        found += int(given[5].sum())
-        spans(*given)
-
-    try:
-        raster._test_boxes, raster._test_spans = count_boxes, count_spans  # type: ignore[assignment]
-        ours(task, "soft_raster", torch.device("cpu"))()
-    finally:
-        raster._test_boxes, raster._test_spans = boxes, spans
-    return found
 
 
 def _times(whose: str, times: Times) -> dict[str, float]:

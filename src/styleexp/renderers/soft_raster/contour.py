@@ -171,7 +171,8 @@ def _segments(
     across, along = (q[1] - p[1]).abs(), (q[0] - p[0]).abs()
     preferred = across >= along if along_row else across > along
     first = torch.ceil(torch.minimum(p[1], q[1]) - 0.5).clamp_min(0)
-    beyond = torch.ceil(torch.maximum(p[1], q[1]) - 0.5).clamp_max(depth.shape[1 if along_row else 2])
+    lines = depth.shape[1 if along_row else 2]
+    beyond = torch.ceil(torch.maximum(p[1], q[1]) - 0.5).clamp_max(lines)
     count = torch.where(a_front | b_front, beyond - first, 0.0).nan_to_num(nan=0.0).clamp_min(0)
     first = first.nan_to_num(nan=0.0)
     return _Segments(p, q, view, face, start, end, preferred, first, count.long())

@@ -248,7 +248,10 @@ def _rows(
     count = bottom.sub_(0.5).ceil_().clamp_(0, height).sub_(first)
     # Rounding may move where an edge crosses a row: left out is what is clearly between columns.
     left, right = _range(t.x)
-    left, right = left.sub_(0.51).ceil_().clamp_(0, width), right.sub_(0.49).ceil_().clamp_(0, width)
+    left, right = (
+        left.sub_(0.51).ceil_().clamp_(0, width),
+        right.sub_(0.49).ceil_().clamp_(0, width),
+    )
     return first, count.mul_(right > left).nan_to_num_(nan=0.0).to(torch.int32)
 
 
