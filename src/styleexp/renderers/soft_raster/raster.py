@@ -384,8 +384,8 @@ def _spans(setup: _Setup, part: slice, rows: int, width: int) -> _Spans:
         torch.minimum(beyond, crossing.add_(edges.right[part]), out=beyond)
     for end in (begin, beyond):
         end.sub_(0.5).ceil_().clamp_(0, width)
-    # Both ends are pixels' centres: a triangle with corners that are not numbers has no rows.
-    count = beyond.sub_(begin).clamp_min_(0)
+    # An infinite corner's edges may cross rows nowhere: no span then.
+    count = beyond.sub_(begin).nan_to_num_(nan=0.0).clamp_min_(0)
     steps = (count - 1).clamp_min_(0)
     by_y = (y - s.y).mul_(s.slope_y).add_(s.inverse_w)
     x = (begin - s.x).add_(0.5)
