@@ -438,7 +438,8 @@ def ragged(counts: Int[Tensor, " n"]) -> tuple[Int[Tensor, " total"], Int[Tensor
 
 def _winners(best: Tensor, shape: tuple[int, int, int], dtype: torch.dtype) -> Visible:
     """Unpack the keys; the background's, 0, is that of face -1 at infinity."""
-    high = best.view(torch.int32).view(-1, 2)[:, 1].contiguous()  # torch is little-endian
+    # A copy also of a single number, which is contiguous; torch is little-endian.
+    high = best.view(torch.int32).view(-1, 2)[:, 1].clone(memory_format=torch.contiguous_format)
     pixel = true_indices(high != 0)
     view = _rows_of(pixel, shape[0], shape[1] * shape[2])
     depth = high.view(torch.float32).reciprocal_().to(dtype)
