@@ -190,12 +190,12 @@ def _triangles(points: Tensor, corners: Tensor, pairs: FacePairs, near: float) -
     view, face = pairs.view[crossing], pairs.face[crossing]
     homogeneous = torch.stack([flat.index_select(1, i[crossing]) for i in index])
     clipped = _clip(homogeneous, near)
-    x, y, inverse_w = (
+    both = [
         [torch.cat([row[rest], cut]) for row, cut in zip(rows, parts, strict=True)]
         for rows, parts in zip((whole.x, whole.y, whole.inverse_w), clipped, strict=True)
-    )
+    ]
     view = torch.cat([pairs.view[rest], view, view])
-    return Triangles(x, y, inverse_w, view, torch.cat([pairs.face[rest], face, face]))
+    return Triangles(both[0], both[1], both[2], view, torch.cat([pairs.face[rest], face, face]))
 
 
 def _clip(corners: Float[Tensor, "3 3 n"], near: float) -> Float[Tensor, "3 3 2n"]:
