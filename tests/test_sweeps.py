@@ -430,6 +430,21 @@ def test_jobs_side_by_side_share_the_cores(monkeypatch):
         launchers.overrides("basic", 2)
 
 
+def test_jobs_given_in_batches_are_all_done(undisturbed, tmp_path):
+    """A launcher keeps what each of its jobs returned: of thousands, that fills the memory."""
+    code = (
+        "import sys; from styleexp.cli.sweep import main; from styleexp.sweeps import launchers; "
+    )
+    code += "launchers.MANY = 3; sys.exit(main(sys.argv[1:]))"
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(write_plan(tmp_path)), "--folder", "out"], cwd=tmp_path,
+        capture_output=True, text=True, timeout=600, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "(4 of 4 done)" in done.stdout
+    assert results(tmp_path / "out") == results(undisturbed[0])
+
+
 SBATCH = """\
 #!/bin/sh
 for last; do :; done
