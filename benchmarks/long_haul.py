@@ -256,7 +256,9 @@ def many_jobs(
                 last = time.perf_counter() - begun
             for pid in family(runner.pid):
                 with contextlib.suppress(OSError):
-                    samples.setdefault(pid, []).append(Sample(done, *of_process(pid)))
+                    held = of_process(pid)
+                    if held[0]:  # of one that has just ended nothing is left
+                        samples.setdefault(pid, []).append(Sample(done, *held))
     seconds = time.perf_counter() - begun
     rows = []
     for table in (folder / "sweep").glob("*/table.csv"):
