@@ -23,7 +23,7 @@ STYLE_PIXELS = 720
 STILL_PIXELS = 1280
 MEANINGS = {
     "style_distance": "to the style, by an encoder that was not trained with; 0 the style, 1 none",
-    "relief_distance": "to the style's relief (a picture's brightness), without a network; 0 is equal",
+    "relief_distance": "to the style's relief or a picture's brightness, no network; 0 is equal",
     "relief_rms": "root mean square height of the relief, in radii of the source",
     "relief_share": "that height over the style mesh's own",
     "silhouette_iou": "overlap of the silhouettes with the source's; 1 is equal",
