@@ -344,7 +344,9 @@ class Compose(torch.autograd.Function):
             before = row.index_select(0, target)
             jump = at_outline - row.index_select(0, outer)
             change = row.index_select(0, source).sub_(before).mul_(weight)
-            row.scatter_add_(0, target, change)
+            if len(row):
+                low, high = torch.aminmax(row)
+                row.scatter_add_(0, target, change).clamp_(low, high)  # sums round
             moved = row.index_select(0, target).sub_(before)
             jumps.append(jump.addcmul_(moved, shared).mul_(scale))
         ctx.save_for_backward(target, source, weight, *jumps)
