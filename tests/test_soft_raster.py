@@ -27,6 +27,7 @@ from styleexp.renderers.soft_raster.geometry import (
 )
 from styleexp.renderers.soft_raster.raster import Visible
 from styleexp.renderers.soft_raster.shading import InterpolateAndLight, PickOne
+from styleexp.views import look_at
 
 
 class HardRaster(SoftRaster):
@@ -263,3 +264,16 @@ def test_cuda_equals_cpu(normals: str) -> None:
     assert ((image - cuda_image).abs() > 1e-3).float().mean() < 1e-3
     relative = (gradient - cuda_gradient).norm() / gradient.norm()
     assert relative < 0.02
+
+
+def test_faces_too_small_for_float32_pass_no_gradient():
+    """Found by the random renders: 1 / length^3 of their normals is infinite."""
+    vertices = 1e-7 * torch.tensor([[1.5, -0.3, -2.2], [0.6, -1.1, -1.4], [0.4, 0.8, -0.7]])
+    vertices.requires_grad_()
+    cameras = look_at(torch.tensor([[0.0, 0.0, 0.01]]), torch.zeros(1, 3), 0.1)
+    for normals in ("flat", "smooth"):
+        out = SoftRaster().render(
+            vertices, torch.tensor([[1, 2, 0]]), cameras, Shading(normals=normals), (8, 8)
+        )
+        (gradient,) = torch.autograd.grad(out.image.square().sum(), vertices)
+        assert torch.isfinite(gradient).all()

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
     from styleexp.renderers.base import Cameras
 
-_TINY_SQUARED = 1e-30  # squared length under which a vector has no direction
+_TINY_SQUARED = 1e-25  # squared length under which a vector has no direction: the gradient of
+# rsqrt overflows float32 below 2e-26
 
 
 def pixel_projection(
