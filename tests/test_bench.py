@@ -115,10 +115,10 @@ def test_several_sizes_are_rows(capsys):
 def test_the_instruments_leave_the_renderer_as_it_was():
     from styleexp.renderers.soft_raster import deferred, shading
 
-    before = deferred.FaceNormals, deferred.Compose, shading.InterpolateAndLight
+    before = deferred.FaceNormals, deferred.Compose, shading.LightPixels
     task = render.make_task("bubble", 500, 1, 32)
     render.measure(task, ["soft_raster"], torch.device("cpu"), 1)
-    after = deferred.FaceNormals, deferred.Compose, shading.InterpolateAndLight
+    after = deferred.FaceNormals, deferred.Compose, shading.LightPixels
     assert after == before
 
 

@@ -26,7 +26,12 @@ from styleexp.renderers.soft_raster.geometry import (
     unit,
 )
 from styleexp.renderers.soft_raster.raster import Visible
-from styleexp.renderers.soft_raster.shading import InterpolateAndLight, PickOne
+from styleexp.renderers.soft_raster.shading import (
+    LightPixels,
+    NormalMatrices,
+    PickOne,
+    faces_seen,
+)
 from styleexp.views import look_at
 
 
@@ -111,7 +116,9 @@ def test_gradcheck_smooth_light() -> None:
     visible = Visible(nothing, nothing, pixel, view, face)
 
     def intensity(points: Tensor, normals: Tensor) -> Tensor:
-        return InterpolateAndLight.apply(points, normals, corners, visible, lights, 0.4, 0.9)
+        seen = faces_seen(points, corners, visible)
+        matrices = NormalMatrices.apply(points, normals, seen)
+        return LightPixels.apply(matrices, seen, visible, lights, 0.4, 0.9)
 
     assert ((intensity(points, normals) > 0) & (intensity(points, normals) < 1)).all()
     assert gradcheck(intensity, (points, normals))

@@ -121,7 +121,7 @@ def _depth_at(
         right.append(flat[0].index_select(0, index).addcmul_(center_x, w, value=-1))
         down.append(flat[1].index_select(0, index).addcmul_(center_y, w, value=-1))
         depths.append(w)
-    # Barycentric coordinates times a common factor; see ``InterpolateAndLight``.
+    # Barycentric coordinates times a common factor; see ``NormalMatrices``.
     weights = [down[j] * right[k] - right[j] * down[k] for j, k in ((1, 2), (2, 0), (0, 1))]
     total = weights[0] + weights[1] + weights[2]
     depth = weights[0] * depths[0]

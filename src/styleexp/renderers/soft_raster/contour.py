@@ -105,11 +105,12 @@ def find_crossings(
 ) -> Crossings:
     """All places where a visible contour edge separates two pixels."""
     edges = _contour_edges(points, corners, across, front, pairs.chosen)
+    ends = _ends(points, edges, near)
     found: list[_Found] = []
     held = 0
     # An edge competes for being the outermost along both, though only one will be used.
     for along_row in (True, False):
-        segments = _segments(points, edges, near, visible.depth, along_row)
+        segments = _segments(ends, edges, visible.depth, along_row)
         begin = 0
         for size in chunks(segments.count):
             part = _part(segments, slice(begin, begin + size))
@@ -153,27 +154,40 @@ def _contour_edges(
     return tuple(torch.cat(parts) for parts in zip(*found, strict=True))
 
 
-def _segments(
-    points: Tensor, edges: tuple[Tensor, ...], near: float, depth: Tensor, along_row: bool
-) -> _Segments:
-    """Cut edges at the near plane, project them and find the rows or columns that they meet."""
-    view, face, start, end = edges
+def _ends(
+    points: Tensor, edges: tuple[Tensor, ...], near: float
+) -> tuple[Float[Tensor, "3 m"], Float[Tensor, "3 m"], Bool[Tensor, " m"]]:
+    """Edges cut at the near plane and projected: column, row and 1/w of both ends. And whether any
+    of the edge is in front of that plane."""
+    _, _, start, end = edges
     flat = points.reshape(3, -1)
     a, b = flat.index_select(1, start), flat.index_select(1, end)
-    rise = b[2] - a[2]
-    cut = a + ((near - a[2]) / torch.where(rise == 0, 1.0, rise)) * (b - a)
     a_front, b_front = a[2] >= near, b[2] >= near
-    order = [0, 1] if along_row else [1, 0]
-    p, q = (
-        torch.stack([end[order[0]], end[order[1]], torch.ones_like(rise)]) / end[2].clamp_min(near)
-        for end in (torch.where(a_front, a, cut), torch.where(b_front, b, cut))
-    )
+    if not (a_front & b_front).all():
+        rise = b[2] - a[2]
+        cut = a + ((near - a[2]) / torch.where(rise == 0, 1.0, rise)) * (b - a)
+        a, b = torch.where(a_front, a, cut), torch.where(b_front, b, cut)
+    ends = []
+    for each in (a, b):
+        inverse = 1 / each[2].clamp_min(near)
+        ends.append(torch.stack([each[0] * inverse, each[1] * inverse, inverse]))
+    return ends[0], ends[1], a_front | b_front
+
+
+def _segments(
+    ends: tuple[Tensor, ...], edges: tuple[Tensor, ...], depth: Tensor, along_row: bool
+) -> _Segments:
+    """The rows or columns that projected edges meet."""
+    view, face, start, end = edges
+    p, q, in_front = ends
+    if not along_row:
+        p, q = p[[1, 0, 2]], q[[1, 0, 2]]
     across, along = (q[1] - p[1]).abs(), (q[0] - p[0]).abs()
     preferred = across >= along if along_row else across > along
     first = torch.ceil(torch.minimum(p[1], q[1]) - 0.5).clamp_min(0)
     lines = depth.shape[1 if along_row else 2]
     beyond = torch.ceil(torch.maximum(p[1], q[1]) - 0.5).clamp_max(lines)
-    count = torch.where(a_front | b_front, beyond - first, 0.0).nan_to_num(nan=0.0).clamp_min(0)
+    count = torch.where(in_front, beyond - first, 0.0).nan_to_num(nan=0.0).clamp_min(0)
     first = first.nan_to_num(nan=0.0)
     return _Segments(p, q, view, face, start, end, preferred, first, count.long())
 
@@ -322,7 +336,7 @@ class Compose(torch.autograd.Function):
         image = intensities.new_full((len(intensities), visible.depth.numel()), background)
         for row, values in zip(image, intensities, strict=True):
             row.scatter_(0, visible.pixel, values)
-        coverage = (visible.face_ids.view(-1) >= 0).to(image.dtype)
+        coverage = image.new_zeros(image.shape[1]).scatter_(0, visible.pixel, 1.0)
         ctx.pixel = visible.pixel
         ctx.set_materialize_grads(False)
         if distance is None or outline is None or inner is None or outer is None:
@@ -344,9 +358,11 @@ class Compose(torch.autograd.Function):
             before = row.index_select(0, target)
             jump = at_outline - row.index_select(0, outer)
             change = row.index_select(0, source).sub_(before).mul_(weight)
-            if len(row):
+            if len(target):
                 low, high = torch.aminmax(row)
-                row.scatter_add_(0, target, change).clamp_(low, high)  # sums round
+                row.scatter_add_(0, target, change)
+                # Sums round, and must not leave the range of what they mix.
+                row.scatter_(0, target, row.index_select(0, target).clamp_(low, high))
             moved = row.index_select(0, target).sub_(before)
             jumps.append(jump.addcmul_(moved, shared).mul_(scale))
         ctx.save_for_backward(target, source, weight, *jumps)

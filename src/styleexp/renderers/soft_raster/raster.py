@@ -10,6 +10,7 @@ side given by the top-left rule.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
@@ -374,12 +375,13 @@ def _spans(setup: _Setup, part: slice, rows: int, width: int) -> _Spans:
     s = replace(setup, **{f.name: getattr(setup, f.name)[part] for f in fields(setup)[1:]})
     step = torch.arange(rows, device=s.x.device)[:, None]
     y = s.first + (step + 0.5).to(s.x.dtype)
-    begin = y.new_full(y.shape, -_FAR)
-    beyond = y.new_full(y.shape, _FAR)
+    begins, beyonds = [], []
     for edges in setup.edges:
         crossing = (y - edges.middle_y[part]).mul_(edges.slope[part])
-        torch.maximum(begin, crossing + edges.left[part], out=begin)
-        torch.minimum(beyond, crossing.add_(edges.right[part]), out=beyond)
+        begins.append(crossing + edges.left[part])
+        beyonds.append(crossing.add_(edges.right[part]))
+    begin = functools.reduce(torch.maximum, begins)
+    beyond = functools.reduce(torch.minimum, beyonds)
     for end in (begin, beyond):
         end.sub_(0.5).ceil_().clamp_(0, width)
     # An infinite corner's edges may cross rows nowhere: no span then.

@@ -5,6 +5,7 @@ The light is turned into the world once, so that normals need not be turned into
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from styleexp.renderers.soft_raster.geometry import unit, vertex_normals
+from styleexp.renderers.soft_raster.raster import positions
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -69,14 +71,10 @@ class SmoothSurface:
 
     def at_pixels(self, visible: Visible) -> Float[Tensor, "lights winners"]:
         """Intensities of the covered pixels."""
-        return InterpolateAndLight.apply(
-            self.points,
-            self.normals,
-            self.corners,
-            visible,
-            self.light,
-            self.shading.albedo,
-            self.shading.ambient,
+        seen = faces_seen(self.points, self.corners, visible)
+        matrices = NormalMatrices.apply(self.points, self.normals, seen)
+        return LightPixels.apply(
+            matrices, seen, visible, self.light, self.shading.albedo, self.shading.ambient
         )
 
     def at_crossings(self, crossings: Crossings) -> Float[Tensor, "lights n"]:
@@ -121,143 +119,248 @@ class PickOne(torch.autograd.Function):
         return out, None
 
 
-class InterpolateAndLight(torch.autograd.Function):
-    """Interpolate vertex normals at pixels and light them, in one step.
+@dataclass(frozen=True)
+class FacesSeen:
+    """The faces that are seen at any pixel, m of them, in order of the views."""
 
-    The arguments are the homogeneous pixels (3, views, V) and unit normals (3, V) of the vertices,
-    the corners of the faces (3, F), the n covered pixels, the lights (lights, views, 3), and the
-    two constants of the shading. Returns the intensities (lights, n).
+    corners: list[Int[Tensor, " m"]]
+    index: list[Int[Tensor, " m"]]
+    """Of each corner in the flattened (views, V)."""
+    column: Float[Tensor, " m"]
+    """Centre of a pixel of the frame near the face: what its matrix is relative to, since numbers
+    that are relative to the frame would lose their last digits."""
+    row: Float[Tensor, " m"]
+    at_pixel: Int[Tensor, " winners"]
+    """Each covered pixel's face, one of these."""
+
+
+def faces_seen(
+    points: Float[Tensor, "3 views vertices"], corners: Int[Tensor, "3 faces"], visible: Visible
+) -> FacesSeen:
+    """List them. Without gradients: normals do not depend on what matrices are relative to."""
+    views, count = points.shape[1:]
+    height, width = visible.face_ids.shape[1:]
+    key = torch.add(visible.face, visible.view, alpha=corners.shape[1])
+    marked = torch.zeros(views * corners.shape[1], dtype=torch.bool, device=key.device)
+    marked.scatter_(0, key, True)
+    view, face = positions(marked.view(views, -1))
+    # Of the faces that nobody sees nothing is ever read.
+    place = key.new_empty(marked.shape)
+    own = torch.add(face, view, alpha=corners.shape[1])
+    place.scatter_(0, own, torch.arange(len(own), device=key.device))
+    at_corners = [corner.index_select(0, face) for corner in corners]
+    index = [torch.add(corner, view, alpha=count) for corner in at_corners]
+    x, y, w = points.detach().view(3, -1).unbind()
+    depth = w.index_select(0, index[0])
+    column, row = (
+        (axis.index_select(0, index[0]) / depth).nan_to_num_(0.0).clamp_(0, size - 1).floor_() + 0.5
+        for axis, size in ((x, width), (y, height))
+    )
+    return FacesSeen(at_corners, index, column, row, place.index_select(0, key))
+
+
+class NormalMatrices(torch.autograd.Function):
+    """For each face that is seen the matrix from pixels to its interpolated normals.
+
+    Takes the homogeneous pixels (3, views, V) and unit normals (3, V) of the vertices and the m
+    faces; returns (9, m), of each axis of the normal what it grows by from column to column, from
+    row to row, and what it is at the face's own pixel. The length is any.
 
     The weight of a vertex is the cross product of the other two vertices' offsets from the pixel's
     ray, ``(x w - column w, y w - row w)``. That is the perspective-correct barycentric coordinate
     times a common factor, which normalising the normal removes; it needs no division by w and so
-    holds for faces that reach behind the camera.
+    holds for faces that reach behind the camera. It is linear in the pixel, so that what a face's
+    pixels have in common is worked out once.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, points: Tensor, normals: Tensor, seen: FacesSeen) -> Tensor:
+        """Weights of the corners times their normals, summed."""
+        ctx.seen, ctx.shapes = seen, (points.shape, normals.shape)
+        ctx.known = []
+        out = points.new_empty(9, len(seen.column))
+        for part in _parts(seen.column):
+            known = _at_corners(points, normals, seen, part)
+            if any(ctx.needs_input_grad):
+                ctx.known.append(known)
+            _, weights, at_corners = known
+            rows = iter(out[:, part])
+            for axes in zip(*at_corners, strict=True):
+                for along in zip(*weights, strict=True):
+                    _dot(axes, along, out=next(rows))
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:
+        """Back through the products to normals and positions."""
+        seen: FacesSeen = ctx.seen
+        to_points, to_normals = (grad.new_zeros(shape) for shape in ctx.shapes)
+        point_rows = to_points.view(3, -1).unbind()
+        for part, (offsets, weights, at_corners) in zip(
+            _parts(seen.column), ctx.known, strict=True
+        ):
+            column, row = seen.column[part], seen.row[part]
+            by_axis = grad[:, part].unflatten(0, (3, 3))
+            by_pixel = by_axis.transpose(0, 1)
+            to_weights = [[_dot(each, rows) for rows in by_pixel] for each in at_corners]
+            for i in range(3):
+                j, k = (i + 1) % 3, (i + 2) % 3
+                own, index = seen.corners[i][part], seen.index[i][part]
+                for into, rows in zip(to_normals, by_axis, strict=True):
+                    into.scatter_add_(0, own, _dot(rows, weights[i]))
+                # The vertex enters the weights of the other two.
+                right, down, depth = _cross(
+                    to_weights[k], offsets[j], plus=(offsets[k], to_weights[j])
+                )
+                depth.addcmul_(right, column, value=-1).addcmul_(down, row, value=-1)
+                for into, each in zip(point_rows, (right, down, depth), strict=True):
+                    into.scatter_add_(0, index, each)
+        return to_points, to_normals, None
+
+
+def _at_corners(
+    points: Tensor, normals: Tensor, seen: FacesSeen, part: slice
+) -> tuple[list[list[Tensor]], list[list[Tensor]], list[list[Tensor]]]:
+    """Of a part of the faces, and of each corner: its offset from the face's own pixel, the matrix
+    row from pixels to its weight, and its normal."""
+    x, y, w = points.view(3, -1).unbind()
+    offsets = []
+    for each in seen.index:
+        index = each[part]
+        depth = w.index_select(0, index)
+        right = x.index_select(0, index).addcmul_(seen.column[part], depth, value=-1)
+        down = y.index_select(0, index).addcmul_(seen.row[part], depth, value=-1)
+        offsets.append([right, down, depth])
+    # Corners run clockwise on the screen, where rows go down.
+    weights = [_cross(offsets[(i + 2) % 3], offsets[(i + 1) % 3]) for i in range(3)]
+    at = [[axis.index_select(0, each[part]) for axis in normals] for each in seen.corners]
+    return offsets, weights, at
+
+
+class LightPixels(torch.autograd.Function):
+    """Normals of pixels from their faces' matrices, and light on them, in one step.
+
+    The arguments are the ``NormalMatrices`` (9, m) of the faces seen, these, the n covered pixels,
+    the lights (lights, views, 3), and the two constants of the shading. Returns the intensities
+    (lights, n).
     """
 
     @staticmethod
     def forward(
         ctx: Any,
-        points: Tensor,
-        normals: Tensor,
-        corners: Tensor,
+        matrices: Tensor,
+        seen: FacesSeen,
         visible: Visible,
         light: Tensor,
         albedo: float,
         ambient: float,
     ) -> Tensor:
-        """Weights, normal, light."""
-        ctx.shapes = points.shape, normals.shape
-        ctx.rest = visible, albedo, ambient
+        """Normal, light."""
+        ctx.rest = matrices.shape, seen, visible, albedo, ambient
         ctx.known = []
-        out = points.new_empty(len(light), len(visible.pixel))
-        for part in _parts(visible):
-            known = _lit_pixels(points, normals, corners, visible, light, part)
+        # Looked up: dividing integers takes ten times as long.
+        height, width = visible.face_ids.shape[1:]
+        column, row = (torch.arange(n, device=light.device).to(light) for n in (width, height))
+        centers = (column + 0.5).repeat(height), (row + 0.5).repeat_interleave(width)
+        out = matrices.new_empty(len(light), len(visible.pixel))
+        for part in _parts(visible.pixel):
+            known = _lit_pixels(matrices, seen, visible, centers, light, part)
             if any(ctx.needs_input_grad):
                 ctx.known.append(known)
-            *_, raw = known
-            for row, each in zip(out[:, part], raw, strict=True):
+            for row, each in zip(out[:, part], known.lit, strict=True):
                 torch.add(each, ambient, out=row).mul_(albedo).clamp_(0, 1)
         return out
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        """Back through light, normalisation and weights to positions and normals."""
-        visible, albedo, ambient = ctx.rest
-        to_points, to_normals = (grad.new_zeros(shape) for shape in ctx.shapes)
-        point_rows, normal_rows = to_points.view(3, -1).unbind(), to_normals.unbind()
-        for part, known in zip(_parts(visible), ctx.known, strict=True):
-            seen, lights, normal, inverse, lit = known
-            to_normal = [torch.zeros_like(inverse) for _ in range(3)]
-            along = torch.zeros_like(inverse)
-            for each, axes, towards in zip(lit, lights, grad[:, part], strict=True):
+        """Back through light and normalisation to the matrices."""
+        shape, seen, visible, albedo, ambient = ctx.rest
+        to_matrices = grad.new_zeros(shape)
+        by_axis = to_matrices.view(3, 3, -1)
+        for part, known in zip(_parts(visible.pixel), ctx.known, strict=True):
+            to_normal = [torch.zeros_like(known.inverse) for _ in range(3)]
+            along = torch.zeros_like(known.inverse)
+            for each, axes, towards in zip(known.lit, known.lights, grad[:, part], strict=True):
                 raw = (each + ambient).mul_(albedo)
                 towards = torch.ops.aten.hardtanh_backward(towards, raw, 0.0, 1.0)
                 along.addcmul_(towards, each)
                 for into, axis in zip(to_normal, axes, strict=True):
                     into.addcmul_(towards, axis)
             # Along the normal itself there is no change: normalising removes it.
-            inverse = inverse * albedo
-            for into, axis in zip(to_normal, normal, strict=True):
+            inverse = known.inverse * albedo
+            face = seen.at_pixel[part]
+            for rows, into, axis in zip(by_axis, to_normal, known.normal, strict=True):
                 into.addcmul_(axis, along, value=-1).mul_(inverse)
-            to_weight = [_dot(to_normal, each) for each in seen.normals]
-            for i in range(3):
-                j, k = (i + 1) % 3, (i + 2) % 3
-                for into, axis in zip(normal_rows, to_normal, strict=True):
-                    into.scatter_add_(0, seen.corners[i], axis * seen.weights[i])
-                # The vertex enters the weights of the other two.
-                to_right = _cross(to_weight[j], seen.down[k], to_weight[k], seen.down[j])
-                to_down = _cross(to_weight[k], seen.right[j], to_weight[j], seen.right[k])
-                point_rows[0].scatter_add_(0, seen.index[i], to_right)
-                point_rows[1].scatter_add_(0, seen.index[i], to_down)
-                to_w = to_right.mul_(seen.column).addcmul_(to_down, seen.row).neg_()
-                point_rows[2].scatter_add_(0, seen.index[i], to_w)
-        return to_points, to_normals, None, None, None, None, None
+                rows[0].scatter_add_(0, face, into * known.right)
+                rows[1].scatter_add_(0, face, into * known.down)
+                rows[2].scatter_add_(0, face, into)
+        return to_matrices, None, None, None, None, None
 
 
 _AT_ONCE = 1 << 15
-"""Pixels that are shaded at once, so that what is between fits the cache."""
+"""Pixels, or faces, that are shaded at once, so that what is between fits the cache."""
 
 
-def _parts(visible: Visible) -> list[slice]:
-    return [slice(i, i + _AT_ONCE) for i in range(0, len(visible.pixel), _AT_ONCE)]
+def _parts(items: Tensor) -> list[slice]:
+    return [slice(i, i + _AT_ONCE) for i in range(0, len(items), _AT_ONCE)]
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """What n pixels see: of each corner of their faces one array."""
+class _LitPixels:
+    """What is known of n pixels: lists are of the axes."""
 
-    column: Float[Tensor, " n"]
-    """Centre of the pixel."""
-    row: Float[Tensor, " n"]
-    corners: list[Int[Tensor, " n"]]
-    index: list[Int[Tensor, " n"]]
-    """Of the corner in the flattened (views, V)."""
-    right: list[Float[Tensor, " n"]]
-    """Offset from the pixel's ray."""
-    down: list[Float[Tensor, " n"]]
-    weights: list[Float[Tensor, " n"]]
-    normals: list[list[Float[Tensor, " n"]]]
+    right: Float[Tensor, " n"]
+    """Columns from the face's own pixel."""
+    down: Float[Tensor, " n"]
+    lights: list[list[Float[Tensor, " n"]]]
+    normal: list[Float[Tensor, " n"]]
+    inverse: Float[Tensor, " n"]
+    """Of the normal's length before it was normalised."""
+    lit: list[Float[Tensor, " n"]]
+    """The normal times each light."""
 
 
 def _lit_pixels(
-    points: Tensor, normals: Tensor, corners: Tensor, visible: Visible, light: Tensor, part: slice
-) -> tuple[_Seen, list[list[Tensor]], list[Tensor], Tensor, list[Tensor]]:
-    """Of a part of the pixels: what they see, the lights' axes, the unit normal, the inverse of its
-    length before, and its product with each light."""
-    height, width = visible.face_ids.shape[1:]
-    view, face = visible.view[part], visible.face[part]
-    within = visible.pixel[part] - view * (height * width)
-    # Looked up: dividing integers takes ten times as long.
-    centers = [torch.arange(size, device=view.device).to(points) + 0.5 for size in (width, height)]
-    column = centers[0].repeat(height).index_select(0, within)
-    row = centers[1].repeat_interleave(width).index_select(0, within)
-    x, y, w = points.view(3, -1).unbind()
-    first = view * points.shape[2]
-    own = [corner.index_select(0, face) for corner in corners]
-    index = [corner + first for corner in own]
-    right, down = [], []
-    for each in index:
-        depth = w.index_select(0, each)
-        right.append(x.index_select(0, each).addcmul_(column, depth, value=-1))
-        down.append(y.index_select(0, each).addcmul_(row, depth, value=-1))
-    weights = [_cross(down[j], right[k], right[j], down[k]) for j, k in ((1, 2), (2, 0), (0, 1))]
-    at_corners = [[axis.index_select(0, each) for axis in normals] for each in own]
-    normal = [_dot(weights, each) for each in zip(*at_corners, strict=True)]
+    matrices: Tensor,
+    seen: FacesSeen,
+    visible: Visible,
+    centers: tuple[Tensor, Tensor],
+    light: Tensor,
+    part: slice,
+) -> _LitPixels:
+    view, face = visible.view[part], seen.at_pixel[part]
+    within = torch.sub(visible.pixel[part], view, alpha=len(centers[0]))
+    right, down = (
+        center.index_select(0, within).sub_(own.index_select(0, face))
+        for center, own in zip(centers, (seen.column, seen.row), strict=True)
+    )
+    normal = []
+    for rows in matrices.view(3, 3, -1):
+        by_right, by_down, own = (row.index_select(0, face) for row in rows)
+        normal.append(own.addcmul_(by_right, right).addcmul_(by_down, down))
     squared = _dot(normal, normal)
-    inverse = torch.where(squared > 0, squared, 1.0).rsqrt_()
+    inverse = squared.rsqrt_().nan_to_num_(nan=math.nan, posinf=1.0)
     for axis in normal:
         axis.mul_(inverse)
     lights = [[axis.index_select(0, view) for axis in each.t().contiguous()] for each in light]
     lit = [_dot(normal, each) for each in lights]
-    seen = _Seen(column, row, own, index, right, down, weights, at_corners)
-    return seen, lights, normal, inverse, lit
+    return _LitPixels(right, down, lights, normal, inverse, lit)
 
 
-def _dot(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
+def _dot(a: Sequence[Tensor], b: Sequence[Tensor], out: Tensor | None = None) -> Tensor:
     """``a[0] b[0] + a[1] b[1] + a[2] b[2]``."""
-    return (a[0] * b[0]).addcmul_(a[1], b[1]).addcmul_(a[2], b[2])
+    return torch.mul(a[0], b[0], out=out).addcmul_(a[1], b[1]).addcmul_(a[2], b[2])
 
 
-def _cross(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
-    """``a b - c d``."""
-    return (a * b).addcmul_(c, d, value=-1)
+def _cross(
+    a: Sequence[Tensor], b: Sequence[Tensor], plus: tuple[Sequence[Tensor], ...] = ()
+) -> list[Tensor]:
+    """``a`` x ``b``, plus the cross product of two others."""
+    out = []
+    for j, k in ((1, 2), (2, 0), (0, 1)):
+        axis = (a[j] * b[k]).addcmul_(a[k], b[j], value=-1)
+        if plus:
+            c, d = plus
+            axis.addcmul_(c[j], d[k]).addcmul_(c[k], d[j], value=-1)
+        out.append(axis)
+    return out
