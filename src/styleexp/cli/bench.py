@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,9 +11,6 @@ from typing import Any
 
 from styleexp.cli.answers import answer
 from styleexp.errors import UserError
-
-# Read when torch loads; see cli.main.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 FACES = "5000, 20000, 80000, 320000, 1280000"
 

@@ -13,10 +13,6 @@ from typing import TYPE_CHECKING, NoReturn
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-# Spinning OpenMP threads made a 28 ms render take 3 s on two busy cores. Read when torch loads.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-
-
 DEBUG = "debug=true"
 MODES = ("-m", "--multirun", "-r", "--run")
 UNKNOWN_CHOICE = r"Could not find '([\w/]+)/([^'/]+)'"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,9 +13,6 @@ from styleexp.errors import UserError
 
 if TYPE_CHECKING:
     from styleexp.metrics import Judge
-
-# Read when torch loads; see cli.main.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 TRUTH_SOURCES = ("sphere", "torus", "critter")
 """Sources of the truth board that need no files."""
