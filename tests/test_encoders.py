@@ -198,6 +198,25 @@ def test_gram_sums_are_those_of_the_activations(precision, pooling, layers, monk
     assert ours.norm() / theirs.norm() == pytest.approx(1, abs=0.01)
 
 
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+@pytest.mark.parametrize("size", [(8, 6), (7, 9), (2, 3)])
+def test_pooling_and_its_gradient_are_torchs(precision, size, monkeypatch):
+    monkeypatch.setattr(fused, "_PORTION", 200)  # several portions, the last one smaller
+    dtype = torch.float32 if precision == "fp32" else torch.bfloat16
+    generator = torch.Generator().manual_seed(0)
+    # Few values, so that the greatest of four is often there more than once.
+    x = torch.randint(-2, 3, (3, 4, *size), generator=generator).relu().to(dtype)
+    x = x.contiguous(memory_format=torch.channels_last).requires_grad_()
+    expected = functional.max_pool2d(x, 2)
+    towards = torch.randn(expected.shape, generator=generator).to(dtype)
+    expected.backward(towards)
+    with torch.no_grad():
+        pooled, ahead = fused._pool(x, "max")
+        grad = fused._unpool(towards, x, ahead, "max")
+    assert torch.equal(pooled, expected)
+    assert torch.equal(grad, x.grad)
+
+
 def test_masks_of_every_size_make_products_of_a_few_shapes():
     """oneDNN keeps code for each shape: a hundred new ones a step would fill the memory."""
 

@@ -2,10 +2,11 @@ import copy
 
 import pytest
 import torch
+from torch.nn import functional
 
 from styleexp.config import LossConfig
 from styleexp.encoders import Encoder, load_encoder
-from styleexp.losses import StyleLoss, gram_matrix, layer_mask
+from styleexp.losses import StyleLoss, gram_matrix, layer_mask, layer_masks
 from styleexp.viewer import Images
 
 
@@ -39,6 +40,20 @@ def test_mask_keeps_whole_cells_and_erodes_from_holes_but_not_from_the_frame():
     eroded = layer_mask(coverage, (8, 8), 1)
     assert eroded.sum() == 64 - 6
     assert eroded[0, 0, 7]
+
+
+@pytest.mark.parametrize("erosion", [0, 1, 3, 40])
+@pytest.mark.parametrize(("height", "width"), [(64, 64), (97, 50), (31, 125)])
+def test_masks_are_those_that_pooling_gives(height, width, erosion):
+    generator = torch.Generator().manual_seed(height)
+    coarse = torch.rand(3, 1, 6, 5, generator=generator)
+    coverage = functional.interpolate(coarse, (height, width), mode="bilinear")[:, 0]
+    coverage[2, 3, 4] = torch.nan  # foreground is what is known to be
+    shapes = [(height // stride, width // stride) for stride in (1, 2, 4, 8, 16)]
+    for shape, found in zip(shapes, layer_masks(coverage, shapes, erosion), strict=True):
+        hole = functional.adaptive_max_pool2d((1 - coverage.nan_to_num(0))[:, None], shape)
+        hole = functional.max_pool2d(hole, 2 * erosion + 1, stride=1, padding=erosion)
+        assert torch.equal(found, hole[:, 0] < 0.5)
 
 
 def grams(loss, image, coverage=None):

@@ -81,10 +81,29 @@ def layer_mask(
 ) -> Bool[Tensor, "views cells_y cells_x"]:
     """Cells of a layer that see only foreground: wholly covered, and ``erosion`` cells from the
     nearest cell that is not. The frame's own border does not erode."""
-    hole = functional.adaptive_max_pool2d((1 - coverage.detach())[:, None], shape)
-    if erosion:
-        hole = functional.max_pool2d(hole, 2 * erosion + 1, stride=1, padding=erosion)
-    return hole[:, 0] < 0.5
+    return layer_masks(coverage, [shape], erosion)[0]
+
+
+def layer_masks(
+    coverage: Float[Tensor, "views height width"], shapes: Sequence[tuple[int, int]], erosion: int
+) -> list[Bool[Tensor, "views cells_y cells_x"]]:
+    """`layer_mask` of several layers, from one summed-area table of what is not covered: a cell and
+    those around it are one rectangle of pixels."""
+    background = ~(1 - coverage.detach() < 0.5)
+    summed = functional.pad(background, (1, 0, 1, 0)).to(torch.int32)
+    for dim in (1, 2):
+        summed = summed.cumsum(dim, dtype=torch.int32)
+    masks = []
+    for shape in shapes:
+        counted = summed
+        for dim, cells in enumerate(shape, 1):
+            size, cell = coverage.shape[dim], torch.arange(cells, device=coverage.device)
+            first, last = (cell - erosion).clamp_min(0), (cell + erosion).clamp_max(cells - 1)
+            # Sizes that don't divide: a cell is of all pixels that it touches.
+            begin, end = first * size // cells, ((last + 1) * size + cells - 1) // cells
+            counted = counted.index_select(dim, end) - counted.index_select(dim, begin)
+        masks.append(counted == 0)
+    return masks
 
 
 class StyleLoss:
@@ -101,25 +120,28 @@ class StyleLoss:
         images = seen.image.permute(0, 3, 1, 2)
         # A subclass may serve other activations than those that ours takes the sums of.
         if type(self.encoder) is Encoder and self.encoder.is_fused:
-            cells = {
-                name: tuple(size // self.encoder.stride(name) for size in images.shape[2:])
-                for name in self.layers
-            }
-            masks = {name: self._mask(seen, shape) for name, shape in cells.items()}
-            sums = self.encoder.gram_sums(images, masks)
+            cells = [
+                (images.shape[2] // stride, images.shape[3] // stride)
+                for stride in map(self.encoder.stride, self.layers)
+            ]
+            by_name = dict(zip(self.layers, self._masks(seen, cells), strict=True))
+            sums = self.encoder.gram_sums(images, by_name)
             return [
-                mean_gram(sums[name], masks[name], len(images) * math.prod(shape))
-                for name, shape in cells.items()
+                mean_gram(sums[name], by_name[name], len(images) * math.prod(shape))
+                for name, shape in zip(self.layers, cells, strict=True)
             ]
         features = self.encoder(images, self.layers)
         found = [features[name] for name in self.layers]
-        return [gram_matrix(each, self._mask(seen, each.shape[2:])) for each in found]
+        masks = self._masks(seen, [(each.shape[2], each.shape[3]) for each in found])
+        return [gram_matrix(each, mask) for each, mask in zip(found, masks, strict=True)]
 
-    def _mask(self, seen: Images, cells: Sequence[int]) -> Bool[Tensor, "n rows columns"] | None:
-        """Which cells of a layer of this size count."""
+    def _masks(
+        self, seen: Images, cells: Sequence[tuple[int, int]]
+    ) -> Sequence[Bool[Tensor, "n rows columns"] | None]:
+        """Which cells count of layers of these sizes."""
         if not self.config.masked:
-            return None
-        return layer_mask(seen.coverage, (cells[0], cells[1]), self.config.erosion)
+            return [None] * len(cells)
+        return layer_masks(seen.coverage, cells, self.config.erosion)
 
     def distance(self, grams: Grams, target: Grams, scales: list[Tensor]) -> Float[Tensor, ""]:
         """Weighted sum over layers of the squared Frobenius distance (Eq. 8), each divided by its

@@ -36,7 +36,9 @@ EVEN = 256
 """Masked cells are filled up with zeros to a multiple of this. oneDNN keeps code and memory for
 each of a thousand shapes; masks that gave it new ones each step filled 9 GB in a hundred steps."""
 
-_ONE = [1, 1]
+_ONE, _TWO = [1, 1], [2, 2]
+_PORTION = 1 << 20
+"""Bytes of activations that are pooled at once, so that what is between fits the cache."""
 
 
 class Layer(NamedTuple):
@@ -54,8 +56,8 @@ class _Part:
 
     images: slice
     activations: list[Tensor] = field(default_factory=list)
-    where: Tensor | None = None
-    """Of a max-pooling: which cell each value is from."""
+    ahead: Tensor | None = None
+    """Of a max-pooling: by how much each second of two cells exceeds the first; see `_pool`."""
 
 
 class GramSums(torch.autograd.Function):
@@ -88,7 +90,7 @@ class GramSums(torch.autograd.Function):
                     if ctx.needs_input_grad[0]:
                         parts[-1].activations.append(part)
                 if block is not blocks[-1]:
-                    part, parts[-1].where = _pool(part, pooling)
+                    part, parts[-1].ahead = _pool(part, pooling)
                     pooled.append(part)
             x = torch.cat(pooled) if pooled else part
             if ctx.needs_input_grad[0]:
@@ -118,7 +120,7 @@ class GramSums(torch.autograd.Function):
                 if grad is None:
                     here = torch.zeros_like(last)
                 else:
-                    here = _unpool(grad[part.images], last, part.where, pooling)
+                    here = _unpool(grad[part.images], last, part.ahead, pooling)
                 for layer in reversed(block):
                     activation = part.activations.pop()
                     if layer.name in masks:
@@ -174,18 +176,54 @@ def _split(x: Tensor, channels: int) -> Iterator[tuple[slice, Tensor]]:
 
 
 def _pool(x: Tensor, pooling: str) -> tuple[Tensor, Tensor | None]:
-    if pooling == "max":
-        return torch.ops.aten.max_pool2d_with_indices(x, [2, 2], [2, 2])
-    return functional.avg_pool2d(x, 2), None
+    """2x2 pooling; of a maximum also what `_unpool` needs, a sixth of torch's indices' size."""
+    if pooling == "avg":
+        return functional.avg_pool2d(x, 2), None
+    bits = x.permute(0, 2, 3, 1).view(BITS[x.dtype])
+    images, height, width, channels = bits.shape
+    shape = (images, height // 2, width // 2, channels)
+    out, ahead = bits.new_empty(shape), bits.new_empty(3, *shape)
+    for here, (a, b, c, d) in _quarters(bits):
+        upper, lower = torch.maximum(a, b), torch.maximum(c, d)
+        torch.maximum(upper, lower, out=out[here])
+        for i, (first, second) in enumerate(((a, b), (c, d), (upper, lower))):
+            torch.sub(second, first, out=ahead[i][here])
+    return out.view(x.dtype).permute(0, 3, 1, 2), ahead
 
 
-def _unpool(grad: Tensor, x: Tensor, where: Tensor | None, pooling: str) -> Tensor:
-    """The gradient of ``_pool``."""
-    if pooling == "max":
-        return torch.ops.aten.max_pool2d_with_indices_backward(
-            grad, x, [2, 2], [2, 2], [0, 0], _ONE, False, where
-        )
-    return torch.ops.aten.avg_pool2d_backward(grad, x, [2, 2], [2, 2], [0, 0], False, True, None)
+def _unpool(grad: Tensor, x: Tensor, ahead: Tensor | None, pooling: str) -> Tensor:
+    """The gradient of ``_pool``: to the first of equal ones."""
+    if ahead is None:
+        return torch.ops.aten.avg_pool2d_backward(grad, x, _TWO, _TWO, [0, 0], False, True, None)
+    towards = grad.permute(0, 2, 3, 1).contiguous().view(BITS[x.dtype])
+    out = torch.empty_like(x, memory_format=torch.channels_last)
+    bits = out.permute(0, 2, 3, 1).view(BITS[x.dtype])
+    bits[:, towards.shape[1] * 2 :] = 0
+    bits[:, :, towards.shape[2] * 2 :] = 0
+    below = torch.ops.aten.threshold_backward
+    for here, (a, b, c, d) in _quarters(bits):
+        lower = below(towards[here], ahead[2][here], 0)
+        upper = towards[here] ^ lower
+        for both, first, second, i in ((upper, a, b, 0), (lower, c, d, 1)):
+            second.copy_(below(both, ahead[i][here], 0))
+            torch.bitwise_xor(both, second, out=first)
+    return out
+
+
+def _quarters(cells: Tensor) -> Iterator[tuple[tuple[int, slice], tuple[Tensor, ...]]]:
+    """Of (images, rows, columns, channels), in portions that fit the cache: where in the pooled
+    array, and the four cells of each 2x2."""
+    images, height, width, channels = cells.shape
+    rows = max(1, _PORTION // (2 * width * channels * cells.element_size()))
+    for image in range(images):
+        for begin in range(0, height // 2, rows):
+            end = min(begin + rows, height // 2)
+            some = cells[image, 2 * begin : 2 * end, : width // 2 * 2]
+            upper, lower = some[::2], some[1::2]
+            yield (
+                (image, slice(begin, end)),
+                (upper[:, ::2], upper[:, 1::2], lower[:, ::2], lower[:, 1::2]),
+            )
 
 
 def _at(mask: Mask, images: slice) -> Mask:
