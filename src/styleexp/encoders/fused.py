@@ -153,8 +153,9 @@ def add_gram_gradient(grad: Tensor, activation: Tensor, mask: Mask, factor: Tens
     """Add F (D + D^T), 0 outside of the mask, to the gradient in place."""
     cells = activation.permute(0, 2, 3, 1)
     if mask is not None:
-        bits = cells.view(BITS[activation.dtype]) * mask[..., None]
-        cells = bits.view(activation.dtype)
+        bits = BITS[activation.dtype]
+        # Of one type: turning truth values into numbers on the way takes longer than the product.
+        cells = (cells.view(bits) * mask.to(bits)[..., None]).view(activation.dtype)
     rows = grad.permute(0, 2, 3, 1).flatten(0, 2)
     rows.addmm_(cells.flatten(0, 2), factor.to(activation.dtype))
 
