@@ -1,6 +1,9 @@
-"""Draw docs/benchmarks.md's figure from rows of `styleexp-bench render --json`.
+"""Draw docs/benchmarks.md's figures from the JSON of `styleexp-bench`.
 
 python benchmarks/figures.py ROWS.json... OUT.png
+
+Rows of `styleexp-bench render --json` become a render's cost against faces, pixels and views; those
+of `styleexp-bench step --json`, each with other layers, a step's cost against its layers.
 """
 
 import json
@@ -11,31 +14,65 @@ import matplotlib
 matplotlib.use("Agg")
 from matplotlib import pyplot
 
-PARTS = ("visibility", "shading", "outlines", "normals", "projection", "other")
+RENDER_PARTS = ("visibility", "shading", "outlines", "normals", "projection", "other")
+STEP_PARTS = ("encoder", "Gram matrices", "loss", "render", "field")
 
-rows = []
-for name in sys.argv[1:-1]:
-    with open(name) as file:
-        found = json.load(file)
-    rows += found.get("rows", [found])
 
-axes_of = ("faces", "resolution", "views")
-varied = [key for key in axes_of if len({row[key] for row in rows}) > 1]
-figure, axes = pyplot.subplots(
-    1, len(varied), figsize=(5.2 * len(varied), 4), layout="constrained", squeeze=False
-)
-usual = {"faces": 20480, "resolution": 250, "views": 5}
-for axis, key in zip(axes[0], varied, strict=True):
-    others = [k for k in axes_of if k != key]
-    at_usual = [row for row in rows if all(row[k] == usual[k] for k in others)]
-    line = sorted({row[key]: row for row in at_usual}.values(), key=lambda row: row[key])
-    xs = [row[key] for row in line]
-    axis.plot(xs, [row["ours_cpu_ms"] for row in line], "ko-", label="whole")
-    for part in PARTS:
-        spent = [row["parts_cpu_ms"] for row in line]
-        both = [each.get(part, 0) + each.get(f"{part} backward", 0) for each in spent]
-        axis.plot(xs, both, ".-", label=part)
-    axis.set(xscale="log", yscale="log", xlabel=key, ylabel="CPU ms, one thread")
-    axis.grid(alpha=0.3)
-axes[0][0].legend(fontsize=8)
-figure.savefig(sys.argv[-1], dpi=100)
+def with_backward(parts: dict[str, float], name: str) -> float:
+    """What a part takes in both directions."""
+    return parts.get(name, 0) + parts.get(f"{name} backward", 0)
+
+
+def draw_renders(rows: list[dict]) -> None:
+    """A panel for each of faces, resolution and views that varies; the others as usual."""
+    axes_of = ("faces", "resolution", "views")
+    varied = [key for key in axes_of if len({row[key] for row in rows}) > 1]
+    _, axes = pyplot.subplots(
+        1, len(varied), figsize=(5.2 * len(varied), 4), layout="constrained", squeeze=False
+    )
+    usual = {"faces": 20480, "resolution": 250, "views": 5}
+    for axis, key in zip(axes[0], varied, strict=True):
+        others = [k for k in axes_of if k != key]
+        at_usual = [row for row in rows if all(row[k] == usual[k] for k in others)]
+        line = sorted({row[key]: row for row in at_usual}.values(), key=lambda row: row[key])
+        xs = [row[key] for row in line]
+        axis.plot(xs, [row["ours_cpu_ms"] for row in line], "ko-", label="whole")
+        for part in RENDER_PARTS:
+            axis.plot(
+                xs, [with_backward(row["parts_cpu_ms"], part) for row in line], ".-", label=part
+            )
+        axis.set(xscale="log", yscale="log", xlabel=key, ylabel="CPU ms, one thread")
+        axis.grid(alpha=0.3)
+    axes[0][0].legend(fontsize=8)
+
+
+def draw_layers(rows: list[dict]) -> None:
+    """A bar of parts for each row, the cheapest first."""
+    rows = sorted(rows, key=lambda row: row["step_cpu_ms"])
+    _, axis = pyplot.subplots(figsize=(7.2, 0.9 + 0.42 * len(rows)), layout="constrained")
+    names = [", ".join(layer.removeprefix("conv") for layer in row["layers"]) for row in rows]
+    left = [0.0] * len(rows)
+    for part in (*STEP_PARTS, "other"):
+        spent = [with_backward(row["parts_cpu_ms"], part) for row in rows]
+        if part == "other":
+            spent = [row["step_cpu_ms"] - sum_ for row, sum_ in zip(rows, left, strict=True)]
+        axis.barh(names, spent, left=left, label=part)
+        left = [a + b for a, b in zip(left, spent, strict=True)]
+    axis.set(xlabel="CPU ms of a step, one thread", ylabel="layers")
+    axis.legend(fontsize=8, ncols=3)
+
+
+def main(names: list[str], out: str) -> None:
+    """Read all rows and draw what they are."""
+    rows = []
+    for name in names:
+        with open(name) as file:
+            found = json.load(file)
+        rows += found.get("rows", [found])
+    draw = draw_layers if "step_cpu_ms" in rows[0] else draw_renders
+    draw(rows)
+    pyplot.savefig(out, dpi=100)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:-1], sys.argv[-1])

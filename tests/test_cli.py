@@ -237,6 +237,20 @@ def test_import_loads_nothing_heavy():
     assert done.stdout.strip() == "[]"
 
 
+@pytest.mark.parametrize("told", [{}, {"OMP_WAIT_POLICY": "ACTIVE", "GOMP_SPINCOUNT": "7"}])
+def test_threads_are_told_how_to_wait_before_torch_loads(told):
+    code = (
+        "import os, sys, styleexp.cli\n"
+        "print(os.environ['OMP_WAIT_POLICY'], os.environ['GOMP_SPINCOUNT'], 'torch' in sys.modules)"
+    )
+    names = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
+    env = {key: value for key, value in os.environ.items() if key not in names} | told
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == [*(told.values() or ("PASSIVE", "3000")), "False"]
+
+
 def test_shell_completion_knows_the_choices(tmp_path):
     done = command(
         "-sc", "query=bash", cwd=tmp_path, env={**os.environ, "COMP_LINE": "styleexp style=bub"}

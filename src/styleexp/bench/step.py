@@ -169,6 +169,7 @@ def _told(rows: list[Any], scene: Scene, calls: list[Call], config: Any) -> dict
         "views": [list(shape[:3:2]) for shape, _, _ in calls],
         "steps": len(rows),
         "encoder": config.encoder.name,
+        "layers": list(scene.loss.layers),
         "dtype": getattr(encoder, "precision", "fp32"),
         "device": str(scene.surface.vertices.device),
         "threads": torch.get_num_threads(),

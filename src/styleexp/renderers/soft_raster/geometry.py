@@ -91,10 +91,9 @@ class FaceNormals(torch.autograd.Function):
         grads = grad.unbind(0)
         to_second, to_third = _cross(edges[3:], grads), _cross(grads, edges[:3])
         out = grad.new_zeros(3, ctx.count)
-        for axis in range(3):
-            out[axis].index_add_(0, corners[1], to_second[axis])
-            out[axis].index_add_(0, corners[2], to_third[axis])
-            out[axis].index_add_(0, corners[0], to_second[axis] + to_third[axis], alpha=-1)
+        for row, second, third in zip(out, to_second, to_third, strict=True):
+            row.scatter_add_(0, corners[1], second).scatter_add_(0, corners[2], third)
+            row.scatter_add_(0, corners[0], second.add_(third).neg_())
         return out.t(), None
 
 
@@ -106,9 +105,9 @@ class SumAtVertices(torch.autograd.Function):
         """Add each face's value to its three corners."""
         ctx.save_for_backward(corners)
         out = values.new_zeros(3, count)
-        for axis in range(3):
+        for row, value in zip(out, values, strict=True):
             for corner in corners:
-                out[axis].index_add_(0, corner, values[axis])
+                row.scatter_add_(0, corner, value)
         return out
 
     @staticmethod
