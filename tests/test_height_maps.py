@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from trying import one_encoder
 
 from styleexp import height_maps, meshes, shapes
@@ -79,8 +80,11 @@ def test_the_papers_field_starts_at_the_source_and_has_the_whole_bound():
     assert compose(["source=torus", "style=bubble", "method=paper"]).field.start == "source"
 
 
-def test_a_picture_is_a_height_map_too():
-    scene = prepare(compose([*SMALL, "style=circles"]))
+def test_a_picture_is_a_height_map_too(tmp_path):
+    rows, columns = np.mgrid[:128, :128]
+    waves = np.cos(rows * np.pi / 8) * np.cos(columns * np.pi / 8)
+    Image.fromarray((127.5 + 127.5 * waves).astype(np.uint8)).save(tmp_path / "waves.png")
+    scene = prepare(compose([*SMALL, f"style.path={tmp_path}/waves.png"]))
     torch.testing.assert_close(displace(scene, start(scene)), scene.base, atol=1e-6, rtol=0)
     assert scene.base.std() > 0.2 * scene.relief
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import pytest
@@ -271,6 +272,27 @@ def test_cuda_equals_cpu(normals: str) -> None:
     assert ((image - cuda_image).abs() > 1e-3).float().mean() < 1e-3
     relative = (gradient - cuda_gradient).norm() / gradient.norm()
     assert relative < 0.02
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_the_host_waits_for_the_device_as_often_for_many_views_and_never_backward() -> None:
+    vertices, faces = testing.bumpy_sphere(3)
+    vertices, faces = vertices.cuda().requires_grad_(), faces.cuda()
+    renderer, shading = SoftRaster(), Shading(normals="smooth")
+    waits = []
+    try:
+        for views in (1, 1, 8):  # the first is the warm-up
+            with warnings.catch_warnings(record=True) as told:
+                warnings.simplefilter("always")
+                torch.cuda.set_sync_debug_mode("warn")
+                out = renderer.render(vertices, faces, testing._cameras(views), shading, (64, 64))
+                loss = out.image.square().sum() + out.coverage.sum()
+                waits.append(sum("synchronizing" in str(each.message) for each in told))
+            torch.cuda.set_sync_debug_mode("error")
+            loss.backward()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert waits[1] == waits[2]
 
 
 def test_faces_too_small_for_float32_pass_no_gradient():
