@@ -55,7 +55,7 @@ def draw_layers(rows: list[dict]) -> None:
     for part in (*STEP_PARTS, "other"):
         spent = [with_backward(row["parts_cpu_ms"], part) for row in rows]
         if part == "other":
-            spent = [row["step_cpu_ms"] - sum_ for row, sum_ in zip(rows, left, strict=True)]
+            spent = [row["step_cpu_ms"] - known for row, known in zip(rows, left, strict=True)]
         axis.barh(names, spent, left=left, label=part)
         left = [a + b for a, b in zip(left, spent, strict=True)]
     axis.set(xlabel="CPU ms of a step, one thread", ylabel="layers")

@@ -135,6 +135,8 @@ def vertex_normals(
 
 
 def _cross(a: Any, b: Any) -> list[Tensor]:
+    # Not by `addcmul`, which rounds once: a face without area has a normal of exactly zero only
+    # where both products are rounded alike.
     return [
         a[1] * b[2] - a[2] * b[1],
         a[2] * b[0] - a[0] * b[2],
