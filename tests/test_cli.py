@@ -332,3 +332,89 @@ def test_a_closed_pipe_is_an_interruption_that_can_be_resumed(tmp_path):
     status = json.loads((tmp_path / "run" / "status.json").read_text())
     assert status["status"] == "interrupted"
     assert command("resume=run", cwd=tmp_path).returncode == 0
+
+
+# ------------------------------------------------------------------------- words and leftovers
+
+
+def test_bare_it_explains_itself_and_leaves_nothing(tmp_path):
+    done = command(cwd=tmp_path)
+    assert done.returncode == 2
+    assert "usage: styleexp SOURCE STYLE" in done.stderr
+    assert not any(tmp_path.iterdir())
+
+
+def test_version_is_ours(tmp_path):
+    assert command("--version", cwd=tmp_path).stdout == f"styleexp {styleexp.__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["nowhere.obj", "bubble"], "the source 'nowhere.obj' does not exist"),
+        (["critter", "style.path=nowhere.png"], "the style 'nowhere.png' does not exist"),
+        (["scene.fbx", "bubble"], "'.fbx', which is not read: export it as GLB"),
+        (["part.step", "bubble"], "'.step', which is not read: export it as STL"),
+        (["critter", "bubble", "optim.steps=-3"], "optim.steps=-3 is not allowed"),
+    ],
+)
+def test_a_refusal_loads_no_torch_and_leaves_no_folder(arguments, told, tmp_path):
+    (tmp_path / "scene.fbx").touch()
+    (tmp_path / "part.step").touch()
+    code = (
+        "import sys\n"
+        "from styleexp.cli.main import main\n"
+        "try:\n    main()\n"
+        "except SystemExit as end:\n"
+        "    print(end.code, [m for m in ('torch', 'trimesh', 'scipy') if m in sys.modules])\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert told in done.stderr
+    assert done.stdout == "2 []\n"
+    assert {path.name for path in tmp_path.iterdir()} == {"scene.fbx", "part.step"}
+
+
+def test_help_may_be_cut_off(tmp_path):
+    done = subprocess.run(
+        f"{sys.executable} -m styleexp --help | head -2",
+        shell=True, cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.stderr == ""
+    assert done.stdout.count("\n") == 2
+
+
+def test_an_ascii_terminal_gets_its_sentence(tmp_path):
+    done = command(
+        "李.obj", "bubble", cwd=tmp_path, env={**os.environ, "PYTHONIOENCODING": "ascii"}
+    )
+    assert "\\u674e.obj" in complaint(done)
+
+
+def test_a_working_folder_that_is_gone(tmp_path):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    done = subprocess.run(
+        ["sh", "-c", f"rmdir '{gone}' && exec {sys.executable} -m styleexp critter bubble"],
+        cwd=gone, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert "no longer exists" in complaint(done)
+
+
+def test_long_stages_are_named_and_named_again(monkeypatch, capsys):
+    from styleexp import stages
+
+    monkeypatch.setattr(stages, "FIRST", 0.2)
+    monkeypatch.setattr(stages, "AGAIN", 0.5)
+    with stages.announced():
+        stages.doing("reading")
+        time.sleep(2)
+        stages.doing("")
+        time.sleep(1)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "reading ..."
+    assert lines[1].startswith("reading: ")
+    stages.doing("drawing", at_once=True)  # nobody listens
+    assert capsys.readouterr().out == ""

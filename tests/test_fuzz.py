@@ -21,10 +21,10 @@ import torch
 from corpus import _whole, obj, picture
 
 from styleexp import meshes
-from styleexp.cli.main import explain
 from styleexp.compose import compose
 from styleexp.config import Config, check
 from styleexp.errors import UserError
+from styleexp.explain import explain
 from styleexp.images import load_image
 from styleexp.renderers.base import Shading
 from styleexp.renderers.soft_raster import SoftRaster, contour, deferred

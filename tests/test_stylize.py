@@ -147,3 +147,16 @@ def test_a_missing_device_is_an_error_not_a_fallback():
         pytest.skip("there is a CUDA device, so asking for one is no error")
     with pytest.raises(UserError, match="device=cpu"):
         choose_device("cuda")
+
+
+def test_a_stray_triangle_is_the_remedy_not_the_camera(tmp_path):
+    import trimesh
+
+    ball = trimesh.creation.icosphere(3)
+    far = np.array([[100.0, 0, 0], [101, 0, 0], [100, 1, 0]])
+    stray = np.vstack([ball.vertices, far]), np.vstack([ball.faces, [[642, 643, 644]]])
+    with pytest.raises(UserError, match=r"1 of the 1281 faces of the source .* number 1280"):
+        styleexp.stylize(stray, "bubble", *SMOKE)
+    assert "lie far from all others" not in str(
+        styleexp.stylize("critter", "bubble", *SMOKE).scene.notes
+    )

@@ -393,15 +393,15 @@ def test_a_job_finds_nothing_of_the_one_before_it_in_its_process():
     import numpy as np
     import torch
 
-    from styleexp.cli.run import _default_threads, _reset
     from styleexp.compose import compose
+    from styleexp.process import _default_threads, prepare
 
     given = ("source=torus", "style=rail")
     default = _default_threads()
-    _reset(compose([*given, f"threads={default + 1}"]))
+    prepare(compose([*given, f"threads={default + 1}"]))
     assert torch.get_num_threads() == default + 1
     first = torch.rand(3).tolist(), np.random.rand(3).tolist(), random.random()
-    _reset(compose(given))
+    prepare(compose(given))
     assert torch.get_num_threads() == default
     assert (torch.rand(3).tolist(), np.random.rand(3).tolist(), random.random()) == first
 

@@ -96,13 +96,11 @@ def held_out_losses(
     None for all where the results were saved with more vertices than the source, split at seams.
     """
     import torch
-    from omegaconf import OmegaConf
 
     from styleexp import compose, styles
     from styleexp.scene import prepare
 
-    compose.register()
-    config = compose.typed(OmegaConf.create(settings))
+    config = compose.recorded(settings)
     config.optim.seed += HELD_OUT_SEED  # local views of one seed all come from one bank of cameras
     scene = prepare(config)
     if any(len(vertices) != len(scene.source.vertices) for vertices in results):

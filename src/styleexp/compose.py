@@ -1,16 +1,23 @@
-"""Hydra's configuration of this package, for the command line and for Python callers."""
+"""Hydra's configuration of this package, for the command line and for Python callers.
+
+The command line is a Hydra application and registers everything with Hydra (`register`). A Python
+caller may be another one: for it `compose` works on a store of its own.
+"""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
 from styleexp import config as schema
+from styleexp import overrides as words
 from styleexp import plugins, targets
 from styleexp.assets import names as asset_names
 from styleexp.errors import UserError
@@ -23,9 +30,15 @@ several, by their names."""
 
 
 def register() -> None:
-    """Tell Hydra the schema, and one option for each registered name. Safe to call again."""
+    """Make this process a Hydra application of ours: Hydra gets the schema, one option for each
+    registered name, and the check of what a configuration may call. Safe to call again."""
     targets.guard()
-    store = ConfigStore.instance()
+    _fill(ConfigStore.instance())
+    OmegaConf.register_new_resolver("run_name", _run_name, replace=True)
+
+
+def _fill(store: ConfigStore) -> None:
+    """The schema, and one option for each registered name."""
     store.store(name="base_config", node=schema.Config)
     for name in map(str, schema.CHOICES["preview.name"]):
         store.store(group="preview", name=name, node={"name": name})
@@ -50,12 +63,11 @@ def register() -> None:
         name="styleexp",
         node={"app_name": "styleexp", "header": _header(broken), "template": HELP_TEMPLATE},
     )
-    OmegaConf.register_new_resolver("run_name", _run_name, replace=True)
 
 
 def typed(config: DictConfig) -> schema.Config:
     """The composed configuration as plain dataclasses."""
-    plain = OmegaConf.to_container(config, resolve=True)
+    plain = _literal(OmegaConf.to_container(config, resolve=True))
     assert isinstance(plain, dict)
     parts = {kind: _part(kind, plain.pop(kind, None)) for kind in PARTS}
     loggers = plain.pop("logger", None) or {}
@@ -78,24 +90,40 @@ def recorded(config: Any) -> schema.Config:
     """The configuration of a run's record, which may come from anywhere: all of it is values.
 
     Raises `UserError` for an interpolation, which could read the environment, and for what is not
-    a configuration of this version.
+    a configuration of this version. A file's name may look like one, and isn't taken for one.
     """
     from omegaconf.errors import OmegaConfBaseException
 
-    if "${" in json.dumps(config, default=str):
+    if "${" in json.dumps(_without_files(config), default=str):
         raise UserError("the run's record holds an interpolation (${...}), not values alone.")
     if isinstance(config, dict):
         for part, values in UNNAMED.items():
             if isinstance(config.get(part), dict):
                 config = {**config, part: {**values, **config[part]}}
     try:
-        return typed(OmegaConf.create(config))
+        return typed(OmegaConf.create(_literal(config)))
     except (OmegaConfBaseException, AssertionError, AttributeError, TypeError, ValueError) as error:
         told = (str(error).splitlines() or [type(error).__name__])[0]
         raise UserError(
             f"the run's record is no configuration of this version ({told}): use the version of "
             "styleexp that wrote it."
         ) from error
+
+
+def _literal(node: Any) -> Any:
+    """Values that OmegaConf takes as they are: a file's name may look like an interpolation."""
+    if isinstance(node, dict):
+        return {key: _literal(value) for key, value in node.items()}
+    if isinstance(node, list):
+        return [_literal(value) for value in node]
+    return words.literal(node) if isinstance(node, str) else node
+
+
+def _without_files(node: Any) -> Any:
+    """The same without the values of keys that name files."""
+    if isinstance(node, dict):
+        return {k: _without_files(v) for k, v in node.items() if k not in words.FILES}
+    return [_without_files(value) for value in node] if isinstance(node, list) else node
 
 
 def _part(kind: str, plain: dict[str, Any] | None) -> Any:
@@ -111,19 +139,78 @@ def _part(kind: str, plain: dict[str, Any] | None) -> Any:
 
 
 def compose(overrides: Sequence[str]) -> schema.Config:
-    """The configuration that the command line makes of these overrides."""
-    import hydra
+    """The configuration that the command line makes of these words.
 
-    register()
-    with hydra.initialize_config_module("styleexp.conf", version_base="1.3"):
-        return typed(hydra.compose("config", overrides=list(overrides)))
+    Leaves everything that Hydra and OmegaConf keep for the whole process as it was, so that the
+    caller may be a Hydra application; may be called from several threads.
+    """
+    from hydra._internal.config_loader_impl import ConfigLoaderImpl
+    from hydra._internal.utils import create_config_search_path
+    from hydra.types import RunMode
+    from omegaconf import open_dict
+
+    with _own_hydra() as store:
+        _fill(store)
+        loader = ConfigLoaderImpl(create_config_search_path(CONFIG_PATH))
+        config = targets.load(
+            lambda: loader.load_configuration(
+                "config", words.understood(overrides), RunMode.RUN, from_shell=False
+            )
+        )
+        with open_dict(config):
+            config.pop("hydra")
+        return typed(config)
+
+
+_ONE_AT_A_TIME = threading.RLock()
+
+
+@contextmanager
+def _own_hydra() -> Iterator[ConfigStore]:
+    """Put the state that Hydra keeps for the whole process aside, and back again.
+
+    Its store of configurations starts with Hydra's own alone: a host application may well have a
+    ``base_config`` and a group ``encoder``, too.
+    """
+    import copy
+
+    from hydra import version
+    from hydra.core.plugins import Plugins
+    from hydra.core.singleton import Singleton
+
+    with _ONE_AT_A_TIME:
+        Plugins.instance()  # before the store is copied: plugins register, too
+        theirs = Singleton._instances
+        repo = ConfigStore.instance().repo
+        Singleton._instances = {
+            kind: each
+            for kind, each in theirs.items()
+            if kind not in (ConfigStore, version.VersionBase)
+        }
+        try:
+            version.setbase("1.3")
+            store = ConfigStore.instance()
+            store.repo.update((key, copy.deepcopy(repo[key])) for key in HYDRAS if key in repo)
+            yield store
+        finally:
+            Singleton._instances = theirs
+
+
+HYDRAS = ("hydra", "_dummy_empty_config_.yaml")
+"""What Hydra itself and its plugins keep at the top of their store of configurations."""
+
+NAME_LENGTH = 60
+"""Characters of a file's name that a run's folder begins with; file systems allow 255 bytes."""
 
 
 def _run_name(source: Any, style: Any) -> str:
     from pathlib import PurePath
 
     def short(part: Any) -> str:
-        return PurePath(part.path).stem if part.path else str(part.name)
+        stem = PurePath(part.path).stem if part.path else str(part.name)
+        # Hydra reads its folder's name again as a configuration's value; shells and lists of
+        # files read it, too.
+        return re.sub(r"[\x00-\x1f\x7f$\\/]", "_", stem)[:NAME_LENGTH].strip() or "_"
 
     return f"{short(source)}-{short(style)}"
 

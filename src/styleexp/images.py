@@ -89,6 +89,40 @@ def load_image(path: str | Path, *, background: float = 1.0) -> Float[np.ndarray
     return pixels
 
 
+def from_array(picture: np.ndarray) -> Float[np.ndarray, "height width 3"]:
+    """A picture in memory as float32 RGB in [0, 1]: grey, RGB or RGBA (over white), as integers of
+    8 or 16 bits or as floats in [0, 1].
+
+    Raises `UserError` with the end of a sentence that begins with whose picture it is.
+    """
+    if picture.ndim == 2:
+        picture = picture[..., None]
+    if picture.ndim != 3 or picture.shape[2] not in (1, 3, 4):
+        raise UserError(
+            f"is an array of shape {picture.shape}: a picture is (height, width) or (height, "
+            "width, channels) with 1, 3 or 4 channels."
+        )
+    if min(picture.shape[:2]) < MIN_SIDE:
+        raise UserError(
+            f"is a picture of {picture.shape[1]}x{picture.shape[0]} pixels; it needs at least "
+            f"{MIN_SIDE} on each side."
+        )
+    if picture.dtype in (np.uint8, np.uint16):
+        values = picture.astype(np.float32) / np.iinfo(picture.dtype).max
+    elif np.issubdtype(picture.dtype, np.floating):
+        values = picture.astype(np.float32)
+        if not (np.isfinite(values).all() and values.min() >= 0 and values.max() <= 1):
+            raise UserError("is a picture whose floats are not all in [0, 1]: divide them first.")
+    else:
+        raise UserError(
+            f"is a picture of {picture.dtype}: give 8 or 16 bit integers, or floats in [0, 1]."
+        )
+    if values.shape[2] == 4:
+        alpha = values[..., 3:]
+        values = values[..., :3] * alpha + (1 - alpha)
+    return np.repeat(values, 3, axis=2) if values.shape[2] == 1 else values
+
+
 def fault(content: bytes) -> str:
     """Why a mesh's texture can't be decoded, the end of a sentence; empty if it can."""
     import io

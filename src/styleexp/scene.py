@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
 from styleexp import height_maps, meshes, remembered, styles
@@ -20,11 +21,11 @@ from styleexp.plugins import build
 from styleexp.relief import half_range, mesh_frequency, mesh_relief, picture_frequency
 from styleexp.renderers.base import Shading
 from styleexp.sources import load_source, load_style
+from styleexp.stages import doing
 from styleexp.viewer import Viewer
 from styleexp.views import orbit
 
 if TYPE_CHECKING:
-    import numpy as np
     from jaxtyping import Float
     from torch import Tensor
 
@@ -43,6 +44,10 @@ Of the analytic styles it is 0.10 to 0.16."""
 
 PICTURE_DETAIL = 128
 """Pixels on a picture's longer side when its frequency is measured; finer detail doesn't count."""
+
+
+STRAY = 5.0
+"""A mesh has stray faces where a vertex is so many times farther off than 99 of 100 vertices."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,6 +92,7 @@ def load(config: Config) -> Subject:
     device = choose_device(config.device)
     source = load_source(config.source)
     style = load_style(config.style)
+    doing(f"measuring the source ({len(source.faces):,} faces) and the style")
     frame, surface = normalised(source, device)
     unit = pattern_unit(config.style, source, style if isinstance(style, meshes.Mesh) else None)
     sigma, bound, height = choose_field(config.field, style)
@@ -105,6 +111,8 @@ def load(config: Config) -> Subject:
         notes=(
             *source.repairs,
             *(f"style: {repair}" for repair in getattr(style, "repairs", ())),
+            *stray_faces("source", source),
+            *(stray_faces("style", style) if isinstance(style, meshes.Mesh) else ()),
             *too_coarse(source, size / sigma),
         ),
     )
@@ -113,6 +121,7 @@ def load(config: Config) -> Subject:
 def prepare(config: Config) -> Scene:
     """Load source, style, renderer and encoder, and measure the style."""
     subject = load(config)
+    doing("laying the style's height map on the source")
     base, told = start_of(subject)
     surface, style, unit = subject.surface, subject.style, subject.unit
     device = surface.vertices.device
@@ -129,6 +138,7 @@ def prepare(config: Config) -> Scene:
         about = [mesh.vertices, mesh.faces, scale, lights, shading, str(device)]
 
         def make() -> tuple[Grams, Grams]:
+            doing(f"rendering views of {len(mesh.faces):,} faces for the target")
             seen = Viewer(config, renderer, shading, mesh, scale, lights)
             return styles.mesh_grams(loss, seen, mesh.vertices)
 
@@ -152,6 +162,9 @@ def prepare(config: Config) -> Scene:
     goal, own = target(0), measured(surface, 1.0)(0)
     for what, grams in (("source", own), ("style", goal)):
         if not any(bool(gram.any()) for part in grams for gram in part):
+            mesh = subject.source if what == "source" else style
+            if isinstance(mesh, meshes.Mesh) and (stray := stray_faces(what, mesh)):
+                raise UserError(f"the views see nothing of the {what}: {stray[0]}")
             raise UserError(
                 f"the views see nothing of the {what}, no cell of any style layer is wholly its: "
                 "lower views.distance, or raise views.resolution and views.local.size."
@@ -222,6 +235,23 @@ def too_coarse(mesh: meshes.Mesh, wavelength: float) -> list[str]:
     return [
         f"'{mesh.name}' is coarse for this style: its edges are {edge:.3f} radii long, the style's "
         f"details about {wavelength:.3f}; source.remesh={round(enough, -3)} would carry them."
+    ]
+
+
+def stray_faces(what: str, mesh: meshes.Mesh) -> list[str]:
+    """A note where a few faces lie so far off that the rest is tiny in the unit sphere, and so in
+    all views."""
+    distance = np.linalg.norm(mesh.vertices - np.median(mesh.vertices, axis=0), axis=1)
+    bulk = float(np.quantile(distance, 0.99))
+    far = (distance[mesh.faces] > 3 * bulk).any(axis=1)
+    if distance.max() <= STRAY * bulk or not far.any():
+        return []
+    first = int(far.argmax())
+    x, y, z = mesh.vertices[mesh.faces[first]].mean(axis=0)
+    return [
+        f"{far.sum()} of the {len(far)} faces of the {what} '{mesh.name}' lie far from all others "
+        f"(the first, number {first} from 0, at {x:.4g}, {y:.4g}, {z:.4g}): delete them in a mesh "
+        f"editor, or the rest fills only {100 * bulk / distance.max():.0f} % of every view."
     ]
 
 

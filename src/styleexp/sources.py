@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 from styleexp import assets, images, meshes, plugins, shapes
 from styleexp.errors import UserError, unknown_name
+from styleexp.stages import doing
 
 if TYPE_CHECKING:
     import numpy as np
@@ -17,6 +22,51 @@ IMAGE_SUFFIXES = (
     *(".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff"),
     *(".bmp", ".gif", ".ppm", ".pgm", ".jp2", ".avif"),
 )
+SUFFIXES = (*assets.SUFFIXES["mesh"], *IMAGE_SUFFIXES)
+"""Of the files that can be read."""
+EXPORTS = {
+    **dict.fromkeys((".fbx", ".blend", ".max", ".ma", ".mb", ".c4d", ".dae", ".abc"), "GLB"),
+    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz", ".vrm", ".x3d", ".wrl"), "GLB"),
+    **dict.fromkeys((".3mf", ".amf", ".step", ".stp", ".iges", ".igs", ".brep", ".sldprt"), "STL"),
+    **dict.fromkeys((".xyz", ".las", ".laz", ".e57", ".pcd", ".vtk", ".vtp", ".ztl"), "PLY"),
+    **dict.fromkeys((".exr", ".hdr", ".psd", ".svg", ".heic", ".raw", ".dng"), "PNG"),
+}
+"""What to export from the program that wrote such a file."""
+
+_GIVEN: ContextVar[Mapping[str, Any]] = ContextVar("given", default=MappingProxyType({}))
+
+
+@contextmanager
+def given(**parts: meshes.Mesh | np.ndarray) -> Iterator[None]:
+    """Take the ``source`` or ``style`` from memory, whatever the configuration says."""
+    token = _GIVEN.set(parts)
+    try:
+        yield
+    finally:
+        _GIVEN.reset(token)
+
+
+def check(config: Config) -> None:
+    """Raise `UserError` where a source's or style's file isn't there or is of no readable kind.
+
+    Reads nothing, loads nothing heavy: a mistyped name is told at once.
+    """
+    for kind, part in (("source", config.source), ("style", config.style)):
+        path = locate(kind, part.name, part.path)
+        if path is None:
+            continue
+        if not path.exists():
+            where = "" if path.is_absolute() else f" in '{Path.cwd()}'"
+            raise UserError(f"the {kind} '{path}' does not exist{where}: check its name.")
+        _check_suffix(kind, path)
+
+
+def _check_suffix(kind: str, path: Path) -> None:
+    if export := EXPORTS.get(path.suffix.lower()):
+        raise UserError(
+            f"the {kind} '{path}' ends in '{path.suffix}', which is not read: export it as "
+            f"{export} from the program that made it."
+        )
 
 
 def load_source(config: SourceConfig) -> meshes.Mesh:
@@ -24,12 +74,15 @@ def load_source(config: SourceConfig) -> meshes.Mesh:
     mesh = _load("source", config.name, config.path)
     if not isinstance(mesh, meshes.Mesh):
         raise UserError(f"the source '{config.path or config.name}' is an image: give a mesh.")
-    return meshes.remesh(mesh, config.remesh) if config.remesh else mesh
+    if not config.remesh:
+        return mesh
+    doing(f"remeshing the source to about {config.remesh:,} vertices", at_once=True)
+    return meshes.remesh(mesh, config.remesh)
 
 
 def load_style(config: StyleConfig) -> meshes.Mesh | np.ndarray:
     """The style: a mesh, or an image of shape (height, width, 3) in [0, 1]."""
-    if config.path is None and plugins.known("style", config.name):
+    if "style" not in _GIVEN.get() and config.path is None and plugins.known("style", config.name):
         return _checked(plugins.build("style", config), config.name)
     return _load("style", config.name, config.path)
 
@@ -65,10 +118,14 @@ def locate(kind: str, name: str | None, path: str | None) -> Path | None:
 
 
 def _load(kind: str, name: str | None, path: str | None) -> meshes.Mesh | np.ndarray:
+    if kind in _GIVEN.get():
+        return _GIVEN.get()[kind]
     found = locate(kind, name, path)
     if found is None:
         assert name is not None
         return shapes.make(name)
+    _check_suffix(kind, found)
+    doing(f"reading the {kind} '{found}'")
     if found.suffix.lower() in IMAGE_SUFFIXES:
         return images.load_image(found)
     if kind == "style" and found.suffix.lower() not in (*assets.SUFFIXES["mesh"], ""):

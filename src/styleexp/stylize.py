@@ -19,20 +19,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from styleexp import baselines, meshes, plugins
+from styleexp import baselines, meshes, plugins, process, sources
 from styleexp.compose import compose
 from styleexp.errors import UserError
+from styleexp.explain import explain
 from styleexp.fields import zero_mean
 from styleexp.geometry import unfolded
+from styleexp.overrides import is_file
 from styleexp.scene import Scene, Subject
 from styleexp.scene import prepare as prepare  # this module is a `baselines.Method`
 from styleexp.views import step_generator
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Int
     from torch import Tensor
 
     from styleexp.config import Config, OptimConfig
+    from styleexp.meshes import MeshLike
     from styleexp.viewer import Images
 
 
@@ -92,36 +95,86 @@ class Result:
     vertices: Float[np.ndarray, "vertices 3"]
     """In the source's own frame."""
 
+    @property
+    def faces(self) -> Int[np.ndarray, "faces 3"]:
+        """Indices of M's vertices, the source's faces."""
+        return self.scene.source.faces
+
+    def trimesh(self) -> Any:
+        """M as a ``trimesh.Trimesh`` with these vertices and faces, in this order; the displacement
+        is its vertex attribute ``displacement``."""
+        import trimesh
+
+        return trimesh.Trimesh(
+            self.vertices,
+            self.faces,
+            process=False,
+            vertex_attributes={"displacement": self.displacement},
+        )
+
     def save(self, path: str | Path) -> None:
         """Write M as PLY (with the displacement as a vertex attribute), OBJ or GLB."""
         meshes.save_mesh(self.scene.source, self.vertices, path, self.displacement)
 
 
-def stylize(source: str | Path, style: str | Path, *overrides: str) -> Result:
+def stylize(source: MeshLike, style: MeshLike | np.ndarray, *overrides: str) -> Result:
     """Put the local geometry of ``style``, a mesh or picture, onto the mesh ``source``.
 
-    Both are names or files (what has a suffix or a folder is a file). ``overrides`` are those of
-    the command line: ``stylize("my.obj", "bubble", "profile=fast", "field.sigma=3")``. Writes
-    nothing; ``save`` of what it returns does. Raises `UserError` for what the command line would
-    report.
+    Args:
+        source: a name, a file (what has a suffix or a folder, or exists), a `Mesh`, a
+            ``trimesh.Trimesh``, or ``(vertices, faces)`` of shapes (vertices, 3) and (faces, 3).
+        style: the same, or a picture of shape (height, width) or (height, width, channels), row 0
+            at the top: integers of 8 or 16 bits, or floats in [0, 1].
+        overrides: those of the command line: ``stylize("my.obj", "bubble", "profile=fast",
+            "field.sigma=3")``.
+
+    Returns:
+        The generated mesh. Nothing is written; ``save`` writes it.
+
+    Raises:
+        UserError: for what the command line would report.
+
+    The process is left as it was: torch's number of threads (``threads=`` holds for this call) and
+    its random numbers, and everything of a Hydra application that calls this.
     """
-    config = configure(source, style, overrides)
-    method = baselines.method(config)
-    scene = method.prepare(config)
-    state = method.start(scene)
-    for _ in method.optimise(scene, state):
-        pass
-    return method.finish(scene, state)
+    config, given = configured(source, style, overrides)
+    with sources.given(**given), process.undisturbed(config):
+        method = baselines.method(config)
+        scene = method.prepare(config)
+        state = method.start(scene)
+        for _ in method.optimise(scene, state):
+            pass
+        return method.finish(scene, state)
+
+
+def configured(
+    source: MeshLike, style: MeshLike | np.ndarray, overrides: Sequence[str]
+) -> tuple[Config, dict[str, Any]]:
+    """The configuration of a run, and what of source and style is in memory, by its key."""
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    named = {"source": source, "style": style}
+    known = isinstance(style, str) and plugins.known("style", style)
+    try:
+        config = compose([*([f"style={style}"] if known else []), *overrides])
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(explain(error)) from error
+    given = {}
+    for key, what in named.items():
+        part = getattr(config, key)
+        if isinstance(what, str | Path):
+            what = str(what)
+            setattr(part, "path" if is_file(key, what) else "name", what)
+        else:
+            part.name, part.path = "array", None
+            given[key] = meshes.from_memory(what, key)
+    return config, given
 
 
 def configure(source: str | Path, style: str | Path, overrides: Sequence[str]) -> Config:
     """The configuration of a run, from names or files and the command line's overrides."""
-    chosen = [f"style={style}"] if plugins.known("style", str(style)) else []
-    config = compose([*chosen, *overrides])
-    for part, what in ((config.source, source), (config.style, style)):
-        is_file = Path(what).suffix != "" or Path(what).name != str(what)
-        setattr(part, "path" if is_file else "name", str(what))
-    return config
+    return configured(source, style, overrides)[0]
 
 
 def start(scene: Scene) -> State:
@@ -274,7 +327,7 @@ class _CallableModule(types.ModuleType):
     """Lets ``styleexp.stylize(...)`` work although importing this module puts the module itself
     there."""
 
-    def __call__(self, source: str | Path, style: str | Path, *overrides: str) -> Result:
+    def __call__(self, source: MeshLike, style: MeshLike | np.ndarray, *overrides: str) -> Result:
         return stylize(source, style, *overrides)
 
 

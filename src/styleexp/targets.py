@@ -8,7 +8,7 @@ around, so what they name is looked at before any of it is built.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from styleexp.errors import UserError
@@ -19,31 +19,36 @@ LOGGING = ("logging.StreamHandler", "logging.FileHandler", "logging.NullHandler"
 
 
 def guard() -> None:
-    """Have every configuration that Hydra composes in this process checked. Safe to call again.
-
-    What Hydra raises for odd overrides besides its own errors becomes a `UserError`.
-    """
+    """Have every configuration that Hydra composes in this process checked (`load`). Safe to call
+    again. For processes of ours alone: it changes Hydra."""
     from hydra._internal.config_loader_impl import ConfigLoaderImpl
-    from hydra.errors import HydraException
-    from omegaconf.errors import OmegaConfBaseException
 
     real = ConfigLoaderImpl.load_configuration
     if getattr(real, "checked", False):
         return
 
     def load_configuration(*arguments: Any, **options: Any) -> Any:
-        try:
-            config = real(*arguments, **options)
-        except (HydraException, OmegaConfBaseException):
-            raise
-        except Exception as error:
-            told = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
-            raise UserError(f"the overrides can't be understood: {told}.") from error
-        check(config)
-        return config
+        return load(lambda: real(*arguments, **options))
 
     load_configuration.checked = True  # type: ignore[attr-defined]
     ConfigLoaderImpl.load_configuration = load_configuration  # type: ignore[method-assign]
+
+
+def load(compose: Callable[[], Any]) -> Any:
+    """What ``compose`` returns, checked. What Hydra raises for odd overrides besides its own errors
+    becomes a `UserError`."""
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
+        config = compose()
+    except (HydraException, OmegaConfBaseException, UserError):
+        raise
+    except Exception as error:
+        told = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+        raise UserError(f"the overrides can't be understood: {told}.") from error
+    check(config)
+    return config
 
 
 def check(config: Any) -> None:

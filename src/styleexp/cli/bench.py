@@ -149,8 +149,8 @@ def _checked(overrides: list[str]) -> list[str]:
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
-    from styleexp.cli.main import explain
     from styleexp.compose import compose
+    from styleexp.explain import explain
 
     try:
         compose(overrides)

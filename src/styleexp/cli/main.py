@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
-import difflib
 import os
-import re
 import sys
 import traceback
 import warnings
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
+    from styleexp.errors import UserError
+
 DEBUG = "debug=true"
-MODES = ("-m", "--multirun", "-r", "--run")
-UNKNOWN_CHOICE = r"Could not find '([\w/]+)/([^'/]+)'"
-"""Hydra's words for a name that it has no option for."""
-HYDRA_PLUGINS = {"hydra/launcher": "sweep", "hydra/sweeper": "search"}
-"""Choices that Hydra's plugins bring, and the extra that installs those."""
+USAGE = """\
+usage: styleexp SOURCE STYLE [KEY=VALUE ...]
+
+Put the local geometry of STYLE, a mesh or a picture, onto the mesh SOURCE. Both are files or names.
+
+  styleexp critter bubble                 analytic shapes, always there
+  styleexp my.obj her.ply profile=fast    files; a smaller, faster run
+  styleexp my.obj bark.jpg strength=0.5   a picture as style, half as high
+  styleexp resume=FOLDER                  go on with a run that was stopped
+
+styleexp --help lists all keys and choices, styleexp-assets list the names.
+"""
 
 
 def main() -> None:
@@ -26,21 +33,47 @@ def main() -> None:
     from styleexp.errors import UserError
 
     warnings.showwarning = _show_warning  # type: ignore[assignment]
-    # Hydra's parser refuses overrides on both sides of a flag: `+experiment=x -m profile=fast`.
-    flags = [a for a in sys.argv[1:] if a in MODES]
-    sys.argv[1:] = flags + [a for a in sys.argv[1:] if a not in MODES]
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # names of files go anywhere, also to an ASCII terminal
+            stream.reconfigure(errors="backslashreplace")
     try:
-        resume = [a for a in sys.argv[1:] if a.startswith("resume=")]
-        if resume:
-            _resume(resume[0].removeprefix("resume="))
-        else:
-            _hydra()
+        _command(sys.argv[1:])
+        sys.stdout.flush()
     except UserError as error:
-        if DEBUG in sys.argv:
-            raise
-        _stop(str(error))
+        stop(error)
+    except BrokenPipeError:  # as with `styleexp --help | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
     except KeyboardInterrupt:
         sys.exit(130)
+
+
+def _command(given: list[str]) -> None:
+    from styleexp.errors import UserError
+
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        raise UserError(
+            "the folder that this command was started in no longer exists: change to another."
+        ) from None
+    if not given:
+        print(USAGE, end="", file=sys.stderr)
+        sys.exit(2)
+    if "--version" in given:
+        from styleexp import __version__
+
+        print(f"styleexp {__version__}")
+        return
+    resume = [a for a in given if a.startswith("resume=")]
+    if resume:
+        _resume(resume[0].removeprefix("resume="), [a for a in given if a not in resume])
+    else:
+        from styleexp.cli import arguments
+
+        # Hydra's parser refuses overrides on both sides of a flag: `+experiment=x -m profile=fast`.
+        sys.argv[1:] = arguments.for_hydra(given)
+        _hydra()
 
 
 def _hydra() -> None:
@@ -50,6 +83,7 @@ def _hydra() -> None:
 
     from styleexp import compose
     from styleexp.errors import UserError
+    from styleexp.explain import explain, explain_plugin
     from styleexp.records import first_line
     from styleexp.sweeps import report
 
@@ -62,10 +96,12 @@ def _hydra() -> None:
     try:
         main(_job)()
     except (HydraException, OmegaConfBaseException) as error:
-        _explain_plugin(error)
+        explain_plugin(error)
         if DEBUG in sys.argv:
             raise
         _stop(explain(error))
+    except BrokenPipeError:
+        raise
     except OSError as error:
         if DEBUG in sys.argv:
             raise
@@ -105,7 +141,9 @@ def _job(config: DictConfig) -> float | None:
     try:
         typed = compose.typed(config)
         typed.threads = typed.threads or launchers.threads_each(runtime)
-        code = run(typed, Path(runtime.runtime.output_dir), list(runtime.overrides.task))
+        # As they are in Hydra's grammar: resolved, an escaped "${" in a file's name would be lost.
+        given: Any = OmegaConf.to_container(runtime.overrides.task, resolve=False)
+        code = run(typed, Path(runtime.runtime.output_dir), given)
     except UserError as error:
         if config.debug or in_search:
             raise
@@ -151,74 +189,12 @@ def _list_groups_once() -> None:
     ConfigLoaderImpl.get_group_options = get_group_options  # type: ignore[method-assign]
 
 
-def _explain_plugin(error: BaseException) -> None:
-    """Raise the `UserError` of a plugin that was chosen and can't be used, if that's the matter."""
-    from styleexp import plugins
-
-    choice = re.search(UNKNOWN_CHOICE, str(error))
-    if choice and plugins.known(choice[1], choice[2]):
-        plugins.find(choice[1], choice[2])
-
-
-def explain(error: BaseException) -> str:
-    """Hydra's complaint as one or two sentences, with the nearest known name."""
-    text = str(error)
-    while error.__cause__ is not None:  # Hydra wraps OmegaConf's, which says more
-        error = error.__cause__
-        text += f"\n{error}"
-    choice = re.search(UNKNOWN_CHOICE, text)
-    if choice:
-        from styleexp.errors import unknown_name
-
-        if choice[1] in HYDRA_PLUGINS:
-            extra = "ray" if choice[2] == "ray" else HYDRA_PLUGINS[choice[1]]
-            return (
-                f"Hydra's plugin '{choice[2]}' is not installed: pip install 'styleexp[{extra}]'."
-            )
-        return str(unknown_name(choice[1], choice[2], _options(choice[1])))
-    key = re.search(r"Key '(\w+)' (?:is )?not in", text)
-    if key:
-        from styleexp.config import Config
-
-        known = _keys(Config)
-        near = difflib.get_close_matches(key[1], [k.split(".")[-1] for k in known], n=1)
-        full = [k for k in known if near and k.split(".")[-1] == near[0]]
-        hint = f"did you mean {' or '.join(full)}? " if full else ""
-        return f"there is no key '{key[1]}': {hint}'styleexp --help' lists the keys."
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    told = [x for x in lines if not x.startswith(("full_key", "object_type", "reference_type"))]
-    return ": ".join(dict.fromkeys(told)) or type(error).__name__
-
-
-def _options(group: str) -> list[str]:
-    from hydra._internal.config_loader_impl import ConfigLoaderImpl
-    from hydra._internal.utils import create_config_search_path
-
-    from styleexp import compose
-
-    loader = ConfigLoaderImpl(create_config_search_path(compose.CONFIG_PATH))
-    return loader.get_group_options(group)
-
-
-def _keys(schema: type, prefix: str = "") -> list[str]:
-    import dataclasses
-    import typing
-
-    found = []
-    for name, kind in typing.get_type_hints(schema).items():
-        found.append(prefix + name)
-        if dataclasses.is_dataclass(kind):
-            found += _keys(typing.cast(type, kind), f"{prefix}{name}.")
-    return found
-
-
-def _resume(folder: str) -> None:
+def _resume(folder: str, others: list[str]) -> None:
     from pathlib import Path
 
     from styleexp.cli.run import resume
     from styleexp.errors import UserError
 
-    others = [a for a in sys.argv[1:] if not a.startswith("resume=")]
     if others:
         raise UserError(
             f"resume= goes on with the configuration of its folder and takes no other argument: "
@@ -229,6 +205,13 @@ def _resume(folder: str) -> None:
 
 def _show_warning(message: Warning | str, *details: object) -> None:
     print(f"warning: {message}", file=sys.stderr)
+
+
+def stop(error: UserError) -> NoReturn:
+    """Say what is wrong, with ``debug=true`` also where, and exit with code 2."""
+    if DEBUG in sys.argv:
+        traceback.print_exception(error)
+    _stop(str(error))
 
 
 def _stop(message: str) -> NoReturn:

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import os
-import random
 import re
 import signal
 import sys
 import time
 from contextlib import contextmanager, suppress
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from styleexp import atomic, locks, records
+from styleexp import atomic, locks, process, records
 from styleexp.errors import UserError
+from styleexp.stages import announced, doing
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -94,31 +93,6 @@ def busy(folder: Path) -> str:
     )
 
 
-@cache
-def _default_threads() -> int:
-    import torch
-
-    return torch.get_num_threads()
-
-
-def _reset(config: Config) -> None:
-    """Undo what an earlier run of this process left behind: threads and global generators.
-
-    Mitsuba's variant is set in every call of its renderer.
-    """
-    import numpy as np
-    import torch
-
-    default = _default_threads()  # before it is changed
-    threads = config.threads or default
-    torch.set_num_threads(threads)
-    if "drjit" in sys.modules:
-        sys.modules["drjit"].set_thread_count(threads)
-    random.seed(config.optim.seed)
-    np.random.seed(config.optim.seed % 2**32)
-    torch.manual_seed(config.optim.seed)
-
-
 def _guarded(
     config: Config, folder: records.RunFolder, record: dict[str, Any], resumed: bool
 ) -> int:
@@ -128,7 +102,8 @@ def _guarded(
         folder.write_status("running")
         if not resumed:
             folder.write_json("run.json", record)
-        return _run(config, folder, record, resumed)
+        with announced():
+            return _run(config, folder, record, resumed)
     except BrokenPipeError:  # as with `styleexp ... | head`: the folder is not at fault
         folder.write_status("interrupted", reason="the output was closed by its reader")
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -198,7 +173,7 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
 
     started = time.perf_counter()
     check(config)
-    _reset(config)
+    process.prepare(config)
     if config.preview.name == "pyrender":
         from styleexp.previews import check_available
 
@@ -210,6 +185,7 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
         assets.find(judge, "weights")  # if it can't be had, say so before the run, not after
     method = baselines.method(config)
     scene = method.prepare(config)
+    doing("")
     for note in scene.notes:
         print(f"note: {note}")
     state = method.start(scene)
@@ -243,6 +219,7 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
         if config.report:  # last, as it shows what the others are about
             from styleexp.reports import page
 
+            doing("writing the run's page")
             written.insert(0, page.write_ended(folder.path, result, seconds))
         loggers.finish(result, folder.path, measured, step)
         folder.check()
@@ -301,13 +278,17 @@ def _write_results(
     from styleexp import previews
 
     for name in ("result.ply", "result.obj", "result.glb"):
+        doing(f"writing {name}")
         result.save(folder.path / name)
+    doing("drawing the preview and the turntable")
     folder.write("preview.png", lambda path: previews.write_preview(result, path))
     folder.write("turntable.gif", lambda path: previews.write_turntable(result, path))
     names = ("preview.png", "turntable.gif", "result.glb", "result.ply", "result.obj")
     written = [folder.path / name for name in names]
     config = result.scene.config
+    doing("measuring the result")
     found = _measure(result, config)
+    doing("")
     folder.write_json("metrics.json", found)
     print("  ".join(f"{name} {found[name]:.3g}" for name in SHOWN_METRICS if name in found))
     if config.preview.name == "pyrender":

@@ -62,7 +62,7 @@ def _run(options: argparse.Namespace) -> int:
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
-    from styleexp.cli.main import explain
+    from styleexp.explain import explain
     from styleexp.sweeps import launchers, manifest, plan, runner
 
     read = plan.read(options.plan)

@@ -18,7 +18,7 @@ counter-clockwise seen from outside.
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from styleexp.meshes.mesh import Mesh as Mesh
 from styleexp.meshes.mesh import Normalisation as Normalisation
@@ -28,13 +28,25 @@ from styleexp.meshes.mesh import normalisation as normalisation
 from styleexp.meshes.mesh import vertex_normals as vertex_normals
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    import numpy as np
+    import trimesh
+
+    from styleexp.meshes.memory import from_arrays as from_arrays
+    from styleexp.meshes.memory import from_memory as from_memory
     from styleexp.meshes.reading import load_mesh as load_mesh
     from styleexp.meshes.remeshing import remesh as remesh
     from styleexp.meshes.remeshing import resample as resample
     from styleexp.meshes.writing import save_mesh as save_mesh
 
+    MeshLike: TypeAlias = str | Path | Mesh | trimesh.Trimesh | tuple[np.ndarray, np.ndarray]
+    """A name, a file, or a mesh in memory: see `styleexp.stylize`."""
+
 # These need trimesh, which is loaded when the first of them is used.
 _HOMES = {
+    "from_arrays": "memory",
+    "from_memory": "memory",
     "load_mesh": "reading",
     "remesh": "remeshing",
     "resample": "remeshing",

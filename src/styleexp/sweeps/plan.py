@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from styleexp.errors import UserError, unknown_name
+from styleexp.overrides import quote, understood
 from styleexp.records import essence
 from styleexp.sweeps.jobs import Job, product, varying
 
@@ -76,7 +77,7 @@ class Planned(Job):
 
     def command(self) -> str:
         """The command that does the same."""
-        target = f"hydra.run.dir={quoted(str(self.folder))}"
+        target = f"hydra.run.dir={quote(str(self.folder))}"
         return shlex.join(["styleexp", *self.overrides, "hydra.mode=RUN", target])
 
 
@@ -181,10 +182,11 @@ def jobs(plan: Plan, folder: Path, overrides: Sequence[str] = ()) -> dict[str, l
 
 def _parts(plan: Plan, entry: Entry, overrides: Sequence[str]) -> Iterator[list[list[str]]]:
     base = [f"+experiment={entry.experiment}"] if entry.experiment else []
-    base += [f"profile={plan.profile}", *plan.overrides, *entry.overrides, *overrides]
+    base += [f"profile={plan.profile}"]
+    base += understood([*plan.overrides, *entry.overrides, *overrides], multirun=True)
     for pair in entry.pairs or [[]]:
         chosen = [f"{k}={v}" for k, v in zip(("source", "style"), pair, strict=False)]
-        given = [*base, *chosen]
+        given = [*base, *understood(chosen)]
         params = _params(given)
         seeds = entry.seeds if entry.seeds is not None else plan.seeds
         if seeds and (entry.seeds is not None or "optim.seed" not in params):
@@ -222,10 +224,3 @@ def _readable(overrides: Mapping[str, str]) -> str:
         for k, v in overrides.items()
     ]
     return re.sub(r"[^\w.+-]+", "-", "_".join(words)).strip("-.")[:80] or "run"
-
-
-def quoted(value: str) -> str:
-    """A value that Hydra reads as this very string."""
-    if re.fullmatch(r"[\w/.-]+", value):
-        return value
-    return "'" + value.replace("\\", "\\\\").replace("'", "\\'") + "'"

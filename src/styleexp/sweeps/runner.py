@@ -115,13 +115,13 @@ def _launch(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> E
     from hydra.core.utils import JobStatus
     from hydra.types import HydraContext, RunMode
 
-    from styleexp.sweeps.plan import quoted
+    from styleexp.overrides import quote
 
     with hydra.initialize_config_module("styleexp.conf", version_base="1.3"):
         composed: Any = GlobalHydra.instance().hydra
         config = composed.compose_config(
             "config",
-            [f"hydra.sweep.dir={quoted(str(folder))}", *launcher],
+            [f"hydra.sweep.dir={quote(str(folder))}", *launcher],
             run_mode=RunMode.MULTIRUN,
             from_shell=False,
         )
@@ -135,7 +135,7 @@ def _launch(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> E
         chosen = [each for each in launcher if each.startswith("launcher=")]
         given = []
         for job in jobs:
-            more = [*chosen, f"hydra.sweep.subdir={job.name}"]
+            more = [*chosen, f"hydra.sweep.subdir={quote(job.name)}"]
             if not any(each.startswith("threads=") for each in job.overrides):
                 more.append(f"threads={threads}")
             given.append([*job.overrides, *more])
@@ -164,6 +164,7 @@ def task(config: DictConfig) -> None:
     Skips what another runner does or did in the meantime. Never raises for the job's own failure.
     """
     from hydra.core.hydra_config import HydraConfig
+    from omegaconf import OmegaConf
 
     from styleexp import compose
 
@@ -171,11 +172,13 @@ def task(config: DictConfig) -> None:
     runtime = HydraConfig.get()
     root, folder = Path(runtime.sweep.dir), Path(runtime.runtime.output_dir)
     name = str(runtime.sweep.subdir)
+    # As they are in Hydra's grammar: resolved, an escaped "${" in a file's name would be lost.
+    given: Any = OmegaConf.to_container(runtime.overrides.task, resolve=False)
     compose.register()
     try:
         with AT_WORK, locks.hold(folder):
             if runs.status(folder) not in manifest.ENDED:
-                _work(config, root, folder, name, list(runtime.overrides.task))
+                _work(config, root, folder, name, given)
     except locks.Busy:
         return
 

@@ -1,0 +1,66 @@
+"""Meshes and pictures that a program already holds."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from styleexp import images
+from styleexp.errors import UserError
+from styleexp.meshes.mesh import Carrier, Mesh
+from styleexp.meshes.welding import check_indices, weld
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
+
+def from_memory(given: Any, kind: str) -> Mesh | Float[np.ndarray, "height width 3"]:
+    """A `Mesh` of ``(vertices, faces)`` or of a ``trimesh.Trimesh``, or a picture of an array.
+
+    A `Mesh` is returned as it is. Arrays are copied. ``kind`` is what an error calls it: ``source``
+    or ``style``. Raises `UserError` for what is neither, and for what `load_mesh` and
+    `images.load_image` would refuse.
+    """
+    if isinstance(given, Mesh):
+        return given
+    try:
+        if isinstance(given, np.ndarray):
+            return images.from_array(given)
+        if isinstance(given, tuple | list) and len(given) == 2:
+            return from_arrays(*given)
+        if hasattr(given, "vertices") and hasattr(given, "faces"):
+            return from_arrays(given.vertices, given.faces)
+    except UserError as error:
+        raise UserError(f"the {kind} {error}") from None
+    raise UserError(
+        f"the {kind} is a {type(given).__name__}: give a name, a file, (vertices, faces), a "
+        "trimesh.Trimesh, or an array as a picture."
+    )
+
+
+def from_arrays(
+    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Mesh:
+    """A checked, welded, outward mesh, named ``array``; see `load_mesh`.
+
+    Raises `UserError` with the end of a sentence that begins with whose arrays they are.
+    """
+    points, corners = np.array(vertices, dtype=np.float64), np.array(faces)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise UserError(f"has vertices of shape {points.shape}: give (vertices, 3).")
+    if corners.ndim != 2 or corners.shape[1] != 3 or not np.issubdtype(corners.dtype, np.integer):
+        raise UserError(
+            f"has faces of shape {corners.shape} and type {corners.dtype}: give integers of shape "
+            "(faces, 3)."
+        )
+    corners = corners.astype(np.int64)
+    check_indices(corners, len(points))
+    used, places = np.unique(corners, return_inverse=True)
+    notes = []
+    if len(used) < len(points):
+        notes.append(f"left out {len(points) - len(used)} vertices that no face uses")
+    corners = places.reshape(corners.shape)
+    no_row = np.zeros(len(used), dtype=np.int64)
+    carrier = Carrier(corners, no_row, np.zeros(len(corners), dtype=bool))
+    return weld("array", points[used], carrier, notes)

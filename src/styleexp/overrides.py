@@ -1,0 +1,186 @@
+"""Overrides as people type them, turned into Hydra's grammar.
+
+Hydra's grammar gives a meaning to spaces, brackets, quotes, commas, ``=``, ``$`` and most letters
+that are not English. A file's name may hold any of them, so the values of keys that name files are
+quoted here, and a word without ``=`` is the source or the style.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from styleexp.errors import UserError
+
+FILES = ("path", "weights", "dir", "folder", "file")
+"""Last words of the keys whose values are files and folders, plugins' included."""
+PARTS = ("source", "style")
+"""What words without ``=`` are, in this order; the keys that take a name or a file."""
+FUNCTION = re.compile(r"(choice|glob|interval|range|shuffle|sort|tag)\(.*\)", re.DOTALL)
+"""Hydra's functions, which make several values of one."""
+PLAIN = re.compile(r"(\.{0,2}/)?[A-Za-z_][\w./-]*", re.ASCII)
+"""What Hydra reads as this very text, unless it is a constant."""
+CONSTANTS = ("null", "true", "false", "nan", "inf")
+
+
+def understood(words: Sequence[str], multirun: bool = False) -> list[str]:
+    """The words of a command line as overrides of Hydra's.
+
+    Up to two words without ``=`` are the source and the style, names or files. ``source=`` and
+    ``style=`` take either, too. With ``multirun`` a comma separates values, unless the whole is a
+    file that exists. What is in Hydra's quotes already stays as it is.
+
+    Raises `UserError` for a third such word, for a part that is given twice, for names and files
+    mixed in one sweep, and for a name that is not valid UTF-8.
+    """
+    for word in words:
+        _check_text(word)
+    overrides = [word for word in words if _is_override(word)]
+    free = [word for word in words if not _is_override(word)]
+    if len(free) > len(PARTS):
+        raise UserError(
+            f"'{free[2]}' is one word too many: two words without '=' are the source and the "
+            f"style, here '{free[0]}' and '{free[1]}'; everything else is KEY=VALUE."
+        )
+    for part, word in zip(PARTS, free, strict=False):
+        twice = [o for o in overrides if re.match(rf"{part}(\.path|\.name)?=", o)]
+        if twice:
+            raise UserError(f"the {part} is given twice, as '{word}' and as '{twice[0]}'.")
+    given = [f"{part}={word}" for part, word in zip(PARTS, free, strict=False)]
+    return [_quoted(each, multirun) for each in [*given, *overrides]]
+
+
+def is_file(part: str, value: str) -> bool:
+    """Whether the value of ``source`` or ``style`` is a file, and no name: it is not known as one,
+    and has a suffix or a folder, or exists."""
+    if _known(part, value):
+        return False
+    path = Path(value)
+    return path.suffix != "" or os.sep in value or exists(value)
+
+
+def exists(name: str) -> bool:
+    """Whether there is such a file or folder, ``~`` being the home folder."""
+    try:
+        return bool(name) and os.path.exists(expanded(name))
+    except ValueError:  # it holds a zero byte
+        return False
+
+
+def expanded(name: str) -> str:
+    """The name with a leading ``~`` as the home folder, unless there is a file of that name."""
+    return os.path.expanduser(name) if name[:1] == "~" and not os.path.exists(name) else name
+
+
+def quote(value: str) -> str:
+    """A value that Hydra, and after it OmegaConf, read as this very text."""
+    if PLAIN.fullmatch(value) and value.lower() not in CONSTANTS:
+        return value
+    escaped = re.sub(r"(\\*)'", r"\1\1\\'", literal(value))
+    closed = re.sub(r"(\\+)$", r"\1\1", escaped)
+    return f"'{closed}'"
+
+
+def literal(text: str) -> str:
+    """A text that OmegaConf reads as this very text, and not as an interpolation."""
+    return re.sub(r"(\\*)\$\{", r"\1\1\\${", text)
+
+
+def _check_text(word: str) -> None:
+    try:
+        word.encode()
+    except UnicodeEncodeError:
+        raise UserError(
+            f"'{word}' is not valid UTF-8, which records and pages need: rename the file."
+        ) from None
+
+
+def _is_override(word: str) -> bool:
+    if re.fullmatch(r"~[\w@./-]+", word) and not word.startswith("~/"):
+        return not exists(word)  # Hydra's deletion of a key
+    return "=" in word and not (_looks_like_a_file(word) and os.path.isfile(word))
+
+
+def _looks_like_a_file(word: str) -> bool:
+    from styleexp.sources import SUFFIXES
+
+    return Path(word).suffix.lower() in SUFFIXES
+
+
+def _known(part: str, name: str) -> bool:
+    from styleexp import assets, plugins, shapes
+
+    kinds = ("mesh", "image") if part == "style" else ("mesh",)
+    named = name in shapes.names() or any(name in assets.names(kind) for kind in kinds)
+    return named or (part == "style" and plugins.known("style", name))
+
+
+def _quoted(override: str, multirun: bool) -> str:
+    key, equals, value = override.partition("=")
+    plain = key.lstrip("+")
+    if not equals or plain.startswith("~"):
+        return override
+    if plain in PARTS:
+        return _part(plain, value, multirun)
+    if plain.rsplit(".", 1)[-1] in FILES and "." in plain:
+        return f"{key}={_files(plain, value, multirun)}"
+    return override
+
+
+def _part(part: str, value: str, multirun: bool) -> str:
+    """``source=`` or ``style=`` with names or with files."""
+    values = [value]
+    if multirun and not exists(value) and not FUNCTION.fullmatch(value):
+        values = list(_split(value))
+    files = [is_file(part, _unquoted(each)) for each in values]
+    if not any(files):
+        return f"{part}={value}"
+    if not all(files):
+        named = values[files.index(False)]
+        raise UserError(
+            f"{part}={value} mixes files with the name '{named}': give files alone, as "
+            f"{part}.path=FILE,FILE, or names alone."
+        )
+    return f"{part}.path={_files(f'{part}.path', value, multirun)}"
+
+
+def _files(key: str, value: str, multirun: bool) -> str:
+    """The value of a key that names a file, or several, in Hydra's grammar."""
+    if multirun and not exists(value) and not FUNCTION.fullmatch(value):
+        return ",".join(map(_file, _split(value)))
+    parts = value.split(",")
+    if not multirun and len(parts) > 1 and not exists(value) and all(map(exists, parts)):
+        raise UserError(f"{key}={value} names {len(parts)} files: add -m to take each in turn.")
+    return value if multirun and FUNCTION.fullmatch(value) else _file(value)
+
+
+def _file(value: str) -> str:
+    """One file's name in Hydra's grammar. What isn't there may be null, in Hydra's quotes already,
+    or an interpolation."""
+    as_it_is = value.lower() in ("", "null") or _in_quotes(value) or "${" in value
+    return value if as_it_is and not exists(value) else quote(expanded(value))
+
+
+def _split(value: str) -> Iterator[str]:
+    """Values between commas; a comma within quotes, or within the name of a file that exists, does
+    not separate."""
+    parts = value.split(",")
+    while parts:
+        count = 1
+        for end in range(len(parts), 0, -1):
+            joined = ",".join(parts[:end])
+            if exists(joined) or _in_quotes(joined):
+                count = end
+                break
+        yield ",".join(parts[:count])
+        parts = parts[count:]
+
+
+def _in_quotes(value: str) -> bool:
+    return re.fullmatch(r"'(?:[^'\\]|\\.)*'|\"(?:[^\"\\]|\\.)*\"", value, re.DOTALL) is not None
+
+
+def _unquoted(value: str) -> str:
+    return value[1:-1] if _in_quotes(value) else value
