@@ -32,7 +32,8 @@ def complaint(done):
     """The one line on standard error of a refused command."""
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
-    lines = [x for x in done.stderr.splitlines() if x.strip() and not x.startswith("warning: ")]
+    beside = ("warning: ", "fetching the weights ")  # where the cache is still empty
+    lines = [x for x in done.stderr.splitlines() if x.strip() and not x.startswith(beside)]
     assert len(lines) == 1, done.stderr
     return lines[0]
 

@@ -67,7 +67,7 @@ def _fill(store: ConfigStore) -> None:
 
 def typed(config: DictConfig) -> schema.Config:
     """The composed configuration as plain dataclasses."""
-    plain = _literal(OmegaConf.to_container(config, resolve=True))
+    plain = words.literal(OmegaConf.to_container(config, resolve=True))
     assert isinstance(plain, dict)
     parts = {kind: _part(kind, plain.pop(kind, None)) for kind in PARTS}
     loggers = plain.pop("logger", None) or {}
@@ -101,7 +101,7 @@ def recorded(config: Any) -> schema.Config:
             if isinstance(config.get(part), dict):
                 config = {**config, part: {**values, **config[part]}}
     try:
-        return typed(OmegaConf.create(_literal(config)))
+        return typed(OmegaConf.create(words.literal(config)))
     except (OmegaConfBaseException, AssertionError, AttributeError, TypeError, ValueError) as error:
         told = (str(error).splitlines() or [type(error).__name__])[0]
         raise UserError(
@@ -110,17 +110,8 @@ def recorded(config: Any) -> schema.Config:
         ) from error
 
 
-def _literal(node: Any) -> Any:
-    """Values that OmegaConf takes as they are: a file's name may look like an interpolation."""
-    if isinstance(node, dict):
-        return {key: _literal(value) for key, value in node.items()}
-    if isinstance(node, list):
-        return [_literal(value) for value in node]
-    return words.literal(node) if isinstance(node, str) else node
-
-
 def _without_files(node: Any) -> Any:
-    """The same without the values of keys that name files."""
+    """A record without the values of keys that name files."""
     if isinstance(node, dict):
         return {k: _without_files(v) for k, v in node.items() if k not in words.FILES}
     return [_without_files(value) for value in node] if isinstance(node, list) else node

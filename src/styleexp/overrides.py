@@ -11,6 +11,7 @@ import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from styleexp.errors import UserError
 
@@ -83,9 +84,14 @@ def quote(value: str) -> str:
     return f"'{closed}'"
 
 
-def literal(text: str) -> str:
-    """A text that OmegaConf reads as this very text, and not as an interpolation."""
-    return re.sub(r"(\\*)\$\{", r"\1\1\\${", text)
+def literal(value: Any) -> Any:
+    """A value, with all in it, whose texts OmegaConf reads as these very texts, and not as
+    interpolations."""
+    if isinstance(value, dict):
+        return {key: literal(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [literal(each) for each in value]
+    return re.sub(r"(\\*)\$\{", r"\1\1\\${", value) if isinstance(value, str) else value
 
 
 def _check_text(word: str) -> None:

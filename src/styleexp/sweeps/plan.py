@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from styleexp.errors import UserError, unknown_name
-from styleexp.overrides import quote, understood
+from styleexp.overrides import literal, quote, understood
 from styleexp.records import essence
 from styleexp.sweeps.jobs import Job, product, varying
 
@@ -106,7 +106,8 @@ def read(path: Path) -> Plan:
     for name in names:
         if names.count(name) > 1:
             raise UserError(f"the plan '{path}' has '{name}' twice: give each its own name.")
-    return _typed(Plan, {**content, "experiments": entries}, f"'{path}'")
+    content["experiments"] = [dataclasses.asdict(entry) for entry in entries]
+    return _typed(Plan, content, f"'{path}'")
 
 
 def _typed(schema: Any, content: Any, where: str) -> Any:
@@ -122,7 +123,7 @@ def _typed(schema: Any, content: Any, where: str) -> Any:
         if key not in known:
             raise unknown_name(f"key in {where},", str(key), known)
         try:
-            made = OmegaConf.merge(made, {key: value})
+            made = OmegaConf.merge(made, {key: literal(value)})
         except OmegaConfBaseException as error:
             raise UserError(f"{where}: {key} can't be {value!r}.") from error
     return OmegaConf.to_object(made)
