@@ -219,9 +219,9 @@ ${hydra.help.app_name}: put the local geometry of a mesh or picture onto another
 
 HELP_TEMPLATE = """\
 ${hydra.help.header}
-  styleexp source=spot style=bubble
-  styleexp source.path=my.obj style.path=her.ply
-  styleexp source=critter style.path=peeling.jpg profile=fast
+  styleexp critter bubble
+  styleexp my.obj her.ply
+  styleexp critter peeling.jpg profile=fast
   styleexp method=paper encoder=vgg19 field.sigma=5 source=critter style=stripe
   styleexp resume=outputs/spot-bubble/2026-01-31_12-00-00
 
