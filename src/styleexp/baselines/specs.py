@@ -26,6 +26,21 @@ class DisplacementMapConfig:
 
 
 @dataclass
+class SynthesisConfig:
+    """The style's relief laid on by example; see docs/synthesis.md."""
+
+    name: str = "synthesis"
+    direction: str = "auto"
+    """Which way the pattern's up points. ``up``, ``x``, ``y``, ``z``: along that axis wherever the
+    surface allows it (``up`` is ``y``). ``flow``: smoothly along the form. ``auto``: ``up`` for a
+    style with a direction, ``flow`` for one without."""
+    rotation: float = 0.0
+    """Degrees by which the pattern is turned against that, counter-clockwise seen from outside."""
+    bank: int = 16_000
+    """Patches that are taken of the style at each scale."""
+
+
+@dataclass
 class GeometricTexturesConfig:
     """A GAN on triangles, after Hertz et al. 2020. Sizes are for a CPU."""
 
@@ -59,6 +74,12 @@ def _displacement_map(config: DisplacementMapConfig) -> Method:
     return DisplacementMap(config)
 
 
+def _synthesis(config: SynthesisConfig) -> Method:
+    from styleexp.synthesis.method import Synthesis
+
+    return Synthesis(config)
+
+
 BASELINES: dict[str, Spec] = {
     "displacement_map": Spec(
         "displacement_map",
@@ -71,5 +92,11 @@ BASELINES: dict[str, Spec] = {
         "a GAN on triangles, level by level (Hertz et al. 2020); mesh styles only",
         GeometricTexturesConfig,
         _geometric_textures,
+    ),
+    "synthesis": Spec(
+        "synthesis",
+        "the relief laid on by example, patch by patch (texture synthesis on the surface): seconds",
+        SynthesisConfig,
+        _synthesis,
     ),
 }

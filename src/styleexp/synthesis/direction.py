@@ -1,0 +1,70 @@
+"""A smooth field of unit tangent directions: which way a pattern's up points on a surface."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.sparse import coo_matrix, diags
+from scipy.sparse.linalg import splu
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+    from styleexp.synthesis.walk import Sheet
+
+FLOW, UP = 0.05, 1.0
+"""How much a wish counts beside smoothness: little, and the field flows along the form; much, and
+it holds the wish wherever the surface allows it."""
+
+
+def direction_field(
+    sheet: Sheet, wish: Float[np.ndarray, "vertices 3"], weight: float
+) -> Float[np.ndarray, "vertices 3"]:
+    """The unit tangent field that turns least from vertex to vertex (connection Laplacian) while it
+    follows ``wish`` where that lies in the surface.
+
+    One sparse complex solve. ``wish`` need be neither unit nor tangent; where it stands upright on
+    the surface it has no say.
+    """
+    vertices, normals = sheet.vertices, sheet.normals
+    x, y = frames(normals)
+    edges = np.concatenate([sheet.faces[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
+    edges = np.unique(np.sort(edges, axis=1), axis=0)
+    a, b = edges[edges[:, 0] != edges[:, 1]].T
+    along = vertices[b] - vertices[a]
+    turn = [np.arctan2((along * y[k]).sum(1), (along * x[k]).sum(1)) for k in (a, b)]
+    carried = np.exp(1j * (turn[0] - turn[1]))
+    count = len(vertices)
+    rows, columns = np.concatenate([a, b]), np.concatenate([b, a])
+    both = np.concatenate([-carried, -carried.conj()])
+    laplacian = coo_matrix((both, (rows, columns)), (count, count)).tocsc()
+    degree = np.bincount(rows, minlength=count)
+    tangent = wish - (wish * normals).sum(1, keepdims=True) * normals
+    say = weight * np.linalg.norm(tangent, axis=1) ** 2
+    asked = (tangent * x).sum(1) + 1j * (tangent * y).sum(1)
+    asked = say * asked / np.abs(asked).clip(min=1e-9)
+    # A component that the wish says nothing of would leave the matrix singular.
+    field = splu((laplacian + diags(degree + say + 1e-6)).tocsc()).solve(asked + 1e-9)
+    field /= np.abs(field).clip(min=1e-300)
+    return field.real[:, None] * x + field.imag[:, None] * y
+
+
+def frames(
+    normals: Float[np.ndarray, "vertices 3"],
+) -> tuple[Float[np.ndarray, "vertices 3"], Float[np.ndarray, "vertices 3"]]:
+    """Two unit tangents at each vertex, right-handed with the normal."""
+    reference = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]])
+    x = reference - (reference * normals).sum(1, keepdims=True) * normals
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    return x, np.cross(normals, x)
+
+
+def turned(
+    ahead: Float[np.ndarray, "vertices 3"],
+    normals: Float[np.ndarray, "vertices 3"],
+    angle: Float[np.ndarray, " vertices"] | float,
+) -> Float[np.ndarray, "vertices 3"]:
+    """The directions turned about the normals, by an angle in radians, counter-clockwise."""
+    angle = np.broadcast_to(angle, len(ahead))[:, None]
+    return np.cos(angle) * ahead + np.sin(angle) * np.cross(normals, ahead)

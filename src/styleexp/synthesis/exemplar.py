@@ -1,0 +1,187 @@
+"""The style as an example of a relief: heights over a smooth shape, or a picture's tone.
+
+All lengths are in units of the pattern: radii of a style mesh; a picture's are what
+``style.image_tile`` says.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+import torch
+from torch.nn import functional
+
+from styleexp.metrics.patches import blurred
+from styleexp.relief import smoother
+from styleexp.synthesis.direction import UP, direction_field, turned
+from styleexp.synthesis.walk import Sheet
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch import Tensor
+
+LEAST_SEEN = 0.98
+"""Share of a patch that has to lie on the style mesh, not beyond its boundary."""
+UPRIGHT = 0.35
+"""Sine of the angle between a style mesh's normal and its up below which no patch is taken there:
+round a pole of the direction field patterns turn."""
+SPECTRUM = 25
+"""Samples on a side of the patches that the pattern's wavelength is measured on."""
+
+CLEAR = 0.05
+"""A rise of the heights' likeness, in shares of their variance, that is no chance."""
+
+
+class Exemplar(Protocol):
+    """Where patches come from."""
+
+    @property
+    def extent(self) -> float:
+        """Length of the whole."""
+        ...
+
+    def patches(
+        self, count: int, side: int, spacing: float, rng: np.random.Generator, any_way: bool
+    ) -> Float[Tensor, "patches side side"]:
+        """At most ``count`` patches of heights at a spacing, blurred to it; row 0 lies up.
+        ``any_way`` turns each by an angle of its own."""
+        ...
+
+
+@dataclass(frozen=True)
+class MeshExemplar:
+    """The relief of a style mesh, sampled by walking over its smooth shape."""
+
+    sheet: Sheet
+    """The smooth shape, in the unit sphere."""
+    height: Float[np.ndarray, " vertices"]
+    extent: float = 2.0
+
+    def patches(
+        self, count: int, side: int, spacing: float, rng: np.random.Generator, any_way: bool
+    ) -> Float[Tensor, "patches side side"]:
+        """See `Exemplar`."""
+        sheet = self.sheet
+        up = np.broadcast_to([0.0, 1.0, 0.0], sheet.vertices.shape)
+        ahead = direction_field(sheet, up, UP)
+        lying = np.linalg.norm(np.cross(sheet.normals, up), axis=1)
+        allowed = np.flatnonzero((lying > UPRIGHT) | any_way)
+        # Vertices stand for the area around them: dense parts of a mesh don't count more.
+        share = _areas(sheet)[allowed]
+        start = rng.choice(allowed, count, p=share / share.sum())
+        ahead = ahead[start]
+        if any_way:
+            ahead = turned(ahead, sheet.normals[start], rng.uniform(0, 2 * np.pi, count))
+        points, nears = sheet.grids(start, ahead, side, spacing)
+        seen = sheet.on_the_mesh(points, nears).mean(axis=(1, 2)) >= LEAST_SEEN
+        flat, near = points[seen].reshape(-1, 3), nears[seen].ravel()
+        height = self.height
+        if spacing > 1.5 * sheet.edge:
+            height = smoother(sheet.vertices, sheet.faces, 2 * spacing)(height)
+        sampled = sheet.interpolation(flat, near) @ height.astype(np.float32)
+        return torch.from_numpy(sampled).float().view(-1, side, side)
+
+
+@dataclass(frozen=True)
+class PictureExemplar:
+    """A picture's tone as heights; it is mirrored at its borders."""
+
+    height: Float[Tensor, "rows columns"]
+    pixel: float
+    """Length of a pixel."""
+
+    @property
+    def extent(self) -> float:
+        """Length of the longer side."""
+        return self.pixel * max(self.height.shape)
+
+    def patches(
+        self, count: int, side: int, spacing: float, rng: np.random.Generator, any_way: bool
+    ) -> Float[Tensor, "patches side side"]:
+        """See `Exemplar`."""
+        step = spacing / self.pixel
+        height = self.height[None]
+        if step > 1:
+            height = blurred(height, 0.45 * step)
+        rows, columns = self.height.shape
+        angle = rng.uniform(0, 2 * np.pi, count) if any_way else np.zeros(count)
+        reach = (side // 2) * step * (np.sqrt(2) if any_way else 1.0)
+        middle = [
+            rng.uniform(min(reach, size / 2), max(size - reach, size / 2), count)
+            for size in (rows, columns)
+        ]
+        across = (torch.arange(side) - side // 2) * step
+        down, right = torch.meshgrid(across, across, indexing="ij")
+        cos, sin = (torch.from_numpy(f(angle)).float()[:, None, None] for f in (np.cos, np.sin))
+        y = torch.from_numpy(middle[0]).float()[:, None, None] + cos * down + sin * right
+        x = torch.from_numpy(middle[1]).float()[:, None, None] - sin * down + cos * right
+        grid = torch.stack([2 * x / columns - 1, 2 * y / rows - 1], dim=-1)
+        sampled = functional.grid_sample(
+            height[None], grid.view(1, -1, side, 2), padding_mode="reflection", align_corners=False
+        )
+        return sampled.view(-1, side, side)
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """What an exemplar's patches tell of it."""
+
+    wavelength: float
+    """Twice the distance at which heights first are least alike, in whatever direction."""
+    directed: float
+    """How much the likeness of heights at that distance depends on the direction: its deviation
+    over that of the likeness at all distances."""
+    low: float
+    high: float
+    """1st and 99th percentile of the heights."""
+
+
+def measure(exemplar: Exemplar, rng: np.random.Generator) -> Pattern:
+    """Wavelength, direction and height of an exemplar, by the autocovariance of its heights."""
+    for samples in (60, 150, 375):
+        spacing = exemplar.extent / samples
+        patches = exemplar.patches(1000, SPECTRUM, spacing, rng, any_way=False)
+        centred = patches - patches.mean()
+        middle = centred[:, SPECTRUM // 2, SPECTRUM // 2, None, None]
+        likeness = (middle * centred).mean(0) / centred.square().mean().clamp(min=1e-20)
+        radii = torch.arange(0, SPECTRUM // 2 + 0.01, 0.5)
+        along = _polar(likeness, radii, torch.arange(0, 24) * (np.pi / 24))
+        half = _first_trough(along, radii)
+        if half >= 3:
+            break  # else the pattern is too fine for these samples
+    ring = along[:, (radii >= 0.8 * half) & (radii <= 1.2 * half)].mean(dim=1)
+    directed = float(ring.std() / along.std().clamp(min=1e-6))
+    low, high = np.percentile(patches.numpy(), [1, 99])
+    return Pattern(2 * half * spacing, directed, float(low), float(high))
+
+
+def _first_trough(along: Float[Tensor, "angles radii"], radii: Float[Tensor, " radii"]) -> float:
+    """The smallest radius at which likeness falls and clearly rises again in some direction; where
+    it never does, as in patterns without any order, where it has fallen to a tenth."""
+    least = along[:, 1:-1]
+    trough = (least <= along[:, :-2]) & (least < along[:, 2:])
+    rise = torch.stack([along[:, at + 1 : at + 9].amax(1) for at in range(1, len(radii) - 1)], 1)
+    rise = torch.where(trough, rise - least, 0.0)
+    if float(rise.max()) > CLEAR:
+        clear = rise > 0.5 * rise.max()
+        return float(radii[1:-1][clear.any(dim=0)][0])
+    low = along.mean(dim=0) < 0.1
+    return float(radii[low][0]) if bool(low.any()) else float(radii[-1])
+
+
+def _polar(values: Tensor, radii: Tensor, angles: Tensor) -> Tensor:
+    """A square map at (angles, radii) in pixels from its middle."""
+    half = values.shape[0] // 2
+    x = radii[None] * torch.cos(angles)[:, None] / (half + 0.5)
+    y = radii[None] * torch.sin(angles)[:, None] / (half + 0.5)
+    grid = torch.stack([x, y], dim=-1).float()[None]
+    return functional.grid_sample(values[None, None].float(), grid, align_corners=False)[0, 0]
+
+
+def _areas(sheet: Sheet) -> Float[np.ndarray, " vertices"]:
+    from styleexp import meshes
+
+    third = meshes.face_areas(sheet.vertices, sheet.faces) / 3
+    return np.bincount(sheet.faces.ravel(), np.repeat(third, 3), minlength=len(sheet.vertices))

@@ -1,0 +1,159 @@
+"""Walking over a triangle mesh: where one gets to, and what a function of the vertices is there."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from scipy.sparse import csr_matrix
+from scipy.spatial import cKDTree
+
+from styleexp import meshes
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+    from torch import Tensor
+
+AT_ONCE = 200_000
+"""Points interpolated at once: what they need then fits a cache."""
+MOST_FACES = 24
+"""Faces round a vertex that are looked at; a vertex with more of them is a pole of a fan."""
+
+
+class Sheet:
+    """A mesh to walk on."""
+
+    def __init__(
+        self,
+        vertices: Float[np.ndarray, "vertices 3"],
+        faces: Int[np.ndarray, "faces 3"],
+        normals: Float[np.ndarray, "vertices 3"] | None = None,
+    ):
+        self.vertices = np.ascontiguousarray(vertices, dtype=np.float64)
+        self.faces = faces
+        self.normals = meshes.vertex_normals(vertices, faces) if normals is None else normals
+        self.edge = meshes.mean_edge_length(vertices, faces)
+        self.tree = cKDTree(self.vertices)
+
+    def nearest(self, points: Float[np.ndarray, "points 3"]) -> Int[np.ndarray, " points"]:
+        """The vertex nearest to each point."""
+        return self.tree.query(points, workers=-1)[1]
+
+    def step(
+        self,
+        points: Float[np.ndarray, "points 3"],
+        ahead: Float[np.ndarray, "points 3"],
+        near: Int[np.ndarray, " points"],
+        along: tuple[float, float],
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A step of (forward, to the right) lengths from points on the mesh with unit directions
+        ``ahead`` in it; back on the mesh by the plane of the nearest vertex, the direction carried
+        along. Returns points, directions and nearest vertices."""
+        aside = np.cross(ahead, self.normals[near])
+        moved = points + along[0] * ahead + along[1] * aside
+        near = self.nearest(moved)
+        normal = self.normals[near]
+        moved -= ((moved - self.vertices[near]) * normal).sum(1, keepdims=True) * normal
+        ahead = ahead - (ahead * normal).sum(1, keepdims=True) * normal
+        ahead /= np.linalg.norm(ahead, axis=1, keepdims=True).clip(min=1e-9)
+        return moved, ahead, near
+
+    def grids(
+        self,
+        start: Int[np.ndarray, " grids"],
+        ahead: Float[np.ndarray, "grids 3"],
+        side: int,
+        spacing: float,
+    ) -> tuple[Float[np.ndarray, "grids side side 3"], Int[np.ndarray, "grids side side"]]:
+        """Points of a grid of ``side`` x ``side`` (odd) round each start vertex, walked over the
+        mesh: first along ``ahead``, then to both sides; row 0 lies ahead, column 0 to the left.
+        With them the vertices nearest to them."""
+        half = side // 2
+        points = np.empty((len(start), side, side, 3))
+        nears = np.empty((len(start), side, side), dtype=np.int64)
+
+        def row(number: int, state: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
+            points[:, number, half], nears[:, number, half] = state[0], state[2]
+            for sign in (1, -1):
+                at = state
+                for column in range(1, half + 1):
+                    at = self.step(*at, (0.0, sign * spacing))
+                    points[:, number, half + sign * column] = at[0]
+                    nears[:, number, half + sign * column] = at[2]
+
+        middle = self.vertices[start], ahead, start
+        row(half, middle)
+        for sign in (1, -1):
+            at = middle
+            for count in range(1, half + 1):
+                at = self.step(*at, (sign * spacing, 0.0))
+                row(half - sign * count, at)
+        return points, nears
+
+    def on_the_mesh(
+        self, points: Float[np.ndarray, "... 3"], nears: Int[np.ndarray, ...]
+    ) -> Bool[np.ndarray, ...]:
+        """Whether points, each with its nearest vertex, are not beyond the mesh's boundary."""
+        away = np.linalg.norm(points - self.vertices[nears], axis=-1)
+        return away < 1.5 * self._reach[nears]
+
+    @cached_property
+    def _reach(self) -> Float[np.ndarray, " vertices"]:
+        """Length of the longest edge at each vertex."""
+        longest = np.zeros(len(self.vertices))
+        for a, b in ((0, 1), (1, 2), (2, 0)):
+            ends = self.faces[:, a], self.faces[:, b]
+            length = np.linalg.norm(self.vertices[ends[0]] - self.vertices[ends[1]], axis=1)
+            for end in ends:
+                np.maximum.at(longest, end, length)
+        return longest
+
+    @cached_property
+    def _fans(self) -> tuple[Tensor, Tensor]:
+        """For each vertex the other two corners of the faces round it, (vertices, most, 2), and
+        what gives a point's coordinates along the two edges, (vertices, most, 2, 3)."""
+        count = len(self.vertices)
+        corner = self.faces.ravel()
+        order = np.argsort(corner, kind="stable")
+        face, which = np.divmod(order, 3)
+        valence = np.bincount(corner, minlength=count)
+        place = np.arange(len(order)) - np.repeat(np.cumsum(valence) - valence, valence)
+        most = int(min(valence.max(), MOST_FACES))
+        kept = place < most
+        others = np.tile(np.arange(count)[:, None, None], (1, most, 2))
+        vertex = corner[order]
+        pair = np.stack([self.faces[face, (which + k) % 3] for k in (1, 2)], axis=1)
+        others[vertex[kept], place[kept]] = pair[kept]
+        edges = self.vertices[others] - self.vertices[:, None, None]
+        gram = np.einsum("vfad,vfbd->vfab", edges, edges)
+        largest = np.trace(gram, axis1=2, axis2=3)[..., None, None]
+        gram += np.eye(2) * (1e-9 * largest + 1e-30)
+        solve = np.linalg.solve(gram, edges)
+        return torch.from_numpy(others), torch.from_numpy(solve).float()
+
+    def interpolation(
+        self, points: Float[np.ndarray, "points 3"], nears: Int[np.ndarray, " points"]
+    ) -> csr_matrix:
+        """The matrix, (points, vertices), that interpolates values of the vertices at the points:
+        linear on that face round the nearest vertex which a point lies in or nearest to."""
+        others, solve = self._fans
+        corners, weights = [], []
+        for at in range(0, len(points), AT_ONCE):
+            near = torch.from_numpy(nears[at : at + AT_ONCE])
+            offset = torch.from_numpy(points[at : at + AT_ONCE] - self.vertices[near.numpy()])
+            two = torch.einsum("pfad,pd->pfa", solve[near], offset.float())
+            inside = torch.minimum(two.amin(2), 1 - two.sum(2))
+            # A place of the table without a face has no edges, so its coordinates are zero.
+            inside = torch.where((others[near, :, 0] == near[:, None]), -torch.inf, inside)
+            best = inside.argmax(1)
+            rows = torch.arange(len(near))
+            share = two[rows, best].clamp(0, 1)
+            share = share / share.sum(1, keepdim=True).clamp(min=1)
+            corners.append(torch.cat([near[:, None], others[near, best]], 1))
+            weights.append(torch.cat([1 - share.sum(1, keepdim=True), share], 1))
+        column, weight = torch.cat(corners).numpy(), torch.cat(weights).numpy()
+        begins = np.arange(len(points) + 1) * 3
+        shape = (len(points), len(self.vertices))
+        return csr_matrix((weight.ravel(), column.ravel(), begins), shape)
