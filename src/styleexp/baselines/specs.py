@@ -36,7 +36,7 @@ class SynthesisConfig:
     style with a direction, ``flow`` for one without."""
     rotation: float = 0.0
     """Degrees by which the pattern is turned against that, counter-clockwise seen from outside."""
-    bank: int = 16_000
+    bank: int = 10_000
     """Patches that are taken of the style at each scale."""
 
 

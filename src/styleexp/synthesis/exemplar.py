@@ -7,6 +7,7 @@ All lengths are in units of the pattern: radii of a style mesh; a picture's are 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
+Y = (0.0, 1.0, 0.0)
 LEAST_SEEN = 0.98
 """Share of a patch that has to lie on the style mesh, not beyond its boundary."""
 UPRIGHT = 0.35
@@ -59,19 +61,22 @@ class MeshExemplar:
     height: Float[np.ndarray, " vertices"]
     extent: float = 2.0
 
+    @cached_property
+    def ahead(self) -> Float[np.ndarray, "vertices 3"]:
+        """Which way is up."""
+        return direction_field(self.sheet, np.broadcast_to(Y, self.sheet.vertices.shape), UP)
+
     def patches(
         self, count: int, side: int, spacing: float, rng: np.random.Generator, any_way: bool
     ) -> Float[Tensor, "patches side side"]:
         """See `Exemplar`."""
         sheet = self.sheet
-        up = np.broadcast_to([0.0, 1.0, 0.0], sheet.vertices.shape)
-        ahead = direction_field(sheet, up, UP)
-        lying = np.linalg.norm(np.cross(sheet.normals, up), axis=1)
+        lying = np.linalg.norm(np.cross(sheet.normals, Y), axis=1)
         allowed = np.flatnonzero((lying > UPRIGHT) | any_way)
         # Vertices stand for the area around them: dense parts of a mesh don't count more.
         share = _areas(sheet)[allowed]
         start = rng.choice(allowed, count, p=share / share.sum())
-        ahead = ahead[start]
+        ahead = self.ahead[start]
         if any_way:
             ahead = turned(ahead, sheet.normals[start], rng.uniform(0, 2 * np.pi, count))
         points, nears = sheet.grids(start, ahead, side, spacing)

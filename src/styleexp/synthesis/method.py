@@ -128,10 +128,12 @@ def levels_of(pattern: Pattern, edge: float) -> list[Level]:
     spacing = min(pattern.wavelength / PER_WAVE, COARSEST)
     levels = []
     for rounds in ROUNDS:
-        levels.append(Level(spacing, rounds))
-        spacing /= 2
-        if spacing < 0.8 * edge:
+        last = spacing / 2 < 0.8 * edge or rounds == ROUNDS[-1]
+        share = 1.0 if last else min(1.0, (2 * edge / spacing) ** 2)
+        levels.append(Level(spacing, rounds, share))
+        if last:
             break
+        spacing /= 2
     return levels
 
 

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 COMPONENTS = 24
 """Principal components by which patches are compared."""
-AT_ONCE = 2048
-"""Grids that are compared with the whole bank at once."""
+AT_ONCE = 256
+"""Grids that are compared with the whole bank at once: the distances then fit a cache."""
 TRUST = 0.6
 """A patch's vote counts by its misfit to the power of minus this."""
 
@@ -33,6 +33,8 @@ class Level:
     spacing: float
     """Of a patch's samples, in units of the pattern."""
     rounds: int
+    share: float
+    """Of the vertices that are the middle of a grid: a coarse level needs fewer."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ def synthesise(
     any_way: bool,
     rng: np.random.Generator,
     side: int = 9,
-    most: int = 16_000,
+    most: int = 10_000,
     vote: float = 0.2,
 ) -> Iterator[tuple[int, Float[Tensor, " vertices"]]]:
     """Heights of the vertices, in units of the pattern, after every round, with its number.
@@ -98,18 +100,20 @@ def synthesise(
     done = 0
     for level in levels:
         known = bank(exemplar.patches(most, side, level.spacing, rng, any_way))
-        points, nears = sheet.grids(np.arange(count), ahead, side, level.spacing * unit)
+        middle = np.sort(rng.permutation(count)[: round(level.share * count)])
+        points, nears = sheet.grids(middle, ahead[middle], side, level.spacing * unit)
         sample = sheet.interpolation(points.reshape(-1, 3), nears.ravel())
         spread = sample.T.tocsr()
         if height is None:
             height = known.middles[torch.from_numpy(rng.integers(0, len(known.patches), count))]
         for _ in range(level.rounds):
-            grids = _apply(sample, height).view(count, -1)
+            grids = _apply(sample, height).view(len(middle), -1)
             best, misfit = known.nearest(grids)
             trust = (misfit + 0.02 * misfit.mean() + 1e-12) ** -TRUST
             say = weight * trust[:, None]
             total = _apply(spread, (known.patches[best] * say).flatten())
-            height = total / _apply(spread, say.flatten()).clamp(min=1e-20)
+            asked = _apply(spread, say.flatten())
+            height = torch.where(asked > 0, total / asked.clamp(min=1e-20), height)
             height = matched(height, known.middles)
             done += 1
             yield done, height
