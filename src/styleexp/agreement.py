@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from styleexp import atomic
+from styleexp.reports import runs
 from styleexp.sweeps import report
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ class OnSweepEnd(report.OnSweep):
 
 
 def compare(folder: Path) -> list[dict[str, Any]]:
-    """One row for each run below ``folder``, in the order of the jobs; draws ``figure.png``.
+    """One row for each job of the sweep in ``folder``, in their order; draws ``figure.png``.
 
     ``distance`` is the root mean square distance of the result's vertices from the first run's, as
     a share of the first's root mean square displacement; ``correlation`` that of both
@@ -49,18 +50,17 @@ def compare(folder: Path) -> list[dict[str, Any]]:
     import numpy as np
 
     rows, results = [], []
-    runs = [path.parent for path in folder.glob("*/run.json")]
-    for run in sorted(runs, key=lambda path: (len(path.name), path.name)):
-        record = json.loads((run / "run.json").read_text(encoding="utf-8"))
-        status = json.loads((run / "status.json").read_text(encoding="utf-8"))
+    for job in report.planned(folder):
+        found, run = runs.of_job(job), job.folder
+        named = [o.partition("=")[2] for o in job.overrides if o.startswith("renderer=")]
         row = {
             "run": run.name,
-            "renderer": record["config"]["renderer"]["name"],
-            "status": status["status"],
+            "renderer": found.get("config.renderer.name", "".join(named[-1:])),
+            "status": found["status"],
         }
         rows.append(row)
-        if status["status"] != "done":
-            row["reason"] = status.get("reason", "")
+        if found["status"] != "done":
+            row["reason"] = found["reason"] or ""
             continue
         lines = (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
         steps = [json.loads(line) for line in lines]

@@ -99,13 +99,15 @@ def _job(config: DictConfig) -> float | None:
 
     runtime = HydraConfig.get()
     in_search = objective.LEAST_IOU in os.environ
-    in_sweep = not OmegaConf.is_missing(runtime.job, "num") and not in_search
+    numbered = not OmegaConf.is_missing(runtime.job, "num")
+    in_sweep = numbered and not in_search
     compose.register()  # a launcher's process has not done so
     code = 0
     try:
         typed = compose.typed(config)
         typed.threads = typed.threads or launchers.threads_each(runtime)
-        code = run(typed, Path(runtime.runtime.output_dir), list(runtime.overrides.task))
+        folder = Path(runtime.runtime.output_dir)
+        code = run(typed, folder, list(runtime.overrides.task), again=not numbered)
     except UserError as error:
         if config.debug or in_search:
             raise
@@ -120,7 +122,7 @@ def _job(config: DictConfig) -> float | None:
         raise KeyboardInterrupt
     if code and not in_sweep:
         sys.exit(code)
-    return objective.objective(Path(runtime.runtime.output_dir)) if in_search else None
+    return objective.objective(folder) if in_search else None
 
 
 def _list_groups_once() -> None:

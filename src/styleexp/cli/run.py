@@ -13,8 +13,11 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from styleexp import atomic, locks, records
+from styleexp import atomic, identity, locks, records
 from styleexp.errors import UserError
+from styleexp.reports import runs
+from styleexp.sweeps.claim import PATIENCE, busy
+from styleexp.sweeps.jobs import Job
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -28,13 +31,26 @@ if TYPE_CHECKING:
 
 SHOWN_METRICS = ("style_distance", "silhouette_iou", "flipped_faces", "spike")
 """What is printed of metrics.json."""
-LOCK_PATIENCE = 2.0
-"""Seconds to wait for a folder: who only looks whether it is held, holds it for a moment."""
 
 
-def run(config: Config, folder: Path, overrides: list[str]) -> int:
-    """Stylise and write everything into ``folder``; returns the exit code."""
+def run(config: Config, folder: Path, overrides: list[str], again: bool = True) -> int:
+    """Stylise and write everything into ``folder``; returns the exit code.
+
+    Unless ``again``, as in a sweep, a run that is done is not done again, and another run in the
+    folder is refused, not replaced, unless it failed.
+    """
     with _alone(folder):
+        if not again:
+            job = Job(folder.name, tuple(overrides), folder, identity.job_key(config))
+            found = runs.of_job(job)
+            if found["status"] == "done":
+                print(f"already done: {folder}")
+                return 0
+            if found["status"] == "other" and runs.status(folder) != "failed":
+                raise UserError(
+                    f"'{folder}' is not this job's, {found['reason']}: choose another folder with "
+                    "hydra.sweep.dir=FOLDER, or remove it."
+                )
         return begin(config, folder, overrides)
 
 
@@ -47,8 +63,6 @@ def begin(config: Config, folder: Path, overrides: list[str]) -> int:
     record = records.describe(config, overrides, ["styleexp", *overrides])
     run_folder = records.RunFolder(folder)
     unfinished = run_folder.unfinished(record)
-    if unfinished is not None and not _same_assets(unfinished, config):
-        unfinished = None
     if unfinished is None:
         run_folder.clear()
     return _guarded(config, run_folder, unfinished or record, resumed=unfinished is not None)
@@ -66,32 +80,14 @@ def resume(folder: Path) -> int:
         return _guarded(config, records.RunFolder(folder), record, resumed=True)
 
 
-def _same_assets(record: dict[str, Any], config: Config) -> bool:
-    """Whether source and style are the files that a run began with."""
-    from styleexp import sources
-
-    try:
-        return record.get("assets") in (None, sources.describe(config))
-    except UserError:  # the run itself will say so
-        return False
-
-
 @contextmanager
 def _alone(folder: Path) -> Iterator[None]:
     """Hold the folder's lock: two processes in one folder would mix their files."""
     try:
-        with locks.hold(folder, LOCK_PATIENCE):
+        with locks.hold(folder, PATIENCE):
             yield
     except locks.Busy:
         raise UserError(busy(folder)) from None
-
-
-def busy(folder: Path) -> str:
-    """What is said of a folder that another process holds."""
-    return (
-        f"another process is at work in '{folder}': wait for it, or choose another folder with "
-        "hydra.run.dir=FOLDER."
-    )
 
 
 @cache

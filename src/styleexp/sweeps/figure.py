@@ -131,7 +131,7 @@ def write_figure(jobs: Sequence[Job], folder: RunFolder) -> None:
         part = config.source if cell.kind == "source" else config.style
         key = (cell.kind, repr(part)) if cell.kind != "result" else (cell.kind, cell.job)
         if key not in drawn:
-            drawn[key] = _picture(cell.kind, config, jobs[cell.job].folder, size)
+            drawn[key] = _picture(cell.kind, config, jobs[cell.job], size)
         return drawn[key]
 
     lines = [
@@ -142,13 +142,15 @@ def write_figure(jobs: Sequence[Job], folder: RunFolder) -> None:
 
 def _config(job: Job) -> Config:
     """A job's configuration, from its record or, where it never began, from its overrides."""
-    from styleexp import compose
+    from styleexp import compose, identity
 
     try:
         record = json.loads((job.folder / "run.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return compose.compose([*job.overrides, "hydra.mode=RUN"])
-    return compose.recorded(record["config"])
+        if not identity.not_of(job.key, job.overrides, record):
+            return compose.recorded(record["config"])
+    except (OSError, ValueError, AttributeError):
+        pass
+    return compose.compose([*job.overrides, "hydra.mode=RUN"])
 
 
 def _name(part: Any) -> str:
@@ -156,7 +158,7 @@ def _name(part: Any) -> str:
     return name if getattr(part, "scale", 1.0) == 1.0 else f"{name}, scale {part.scale:g}"
 
 
-def _picture(kind: str, config: Config, folder: Path, size: int) -> Image.Image | str:
+def _picture(kind: str, config: Config, job: Job, size: int) -> Image.Image | str:
     """A picture no larger than ``size``, or words where there is none."""
     import numpy as np
     from PIL import Image
@@ -170,10 +172,10 @@ def _picture(kind: str, config: Config, folder: Path, size: int) -> Image.Image 
         elif kind == "style":
             content = sources.load_style(config.style)
         else:
-            status = runs.read(folder)["status"]
+            status = runs.of_job(job)["status"]
             if status != "done":
-                return str(status)
-            content = meshes.load_mesh(folder / "result.ply")
+                return "another run" if status == "other" else str(status)
+            content = meshes.load_mesh(job.folder / "result.ply")
     except UserError as error:
         return "not found" if kind != "result" else str(error).split(":")[0]
     if isinstance(content, meshes.Mesh):
