@@ -81,28 +81,25 @@ def compare(folder: Path) -> list[dict[str, Any]]:
         difference = np.abs(pictures[-1][1].astype(float) - pictures[0][1].astype(float))
         row["picture"] = float(difference.mean() / 255)
     _draw(pictures, folder / "figure.png")
-    settings = json.loads((folder / results[0][0]["run"] / "run.json").read_text(encoding="utf-8"))
-    distances = held_out_losses(settings["config"], [vertices for _, vertices, *_ in results])
+    distances = held_out_losses(folder / results[0][0]["run"], [v for _, v, *_ in results])
     for (row, *_), distance in zip(results, distances, strict=True):
         row["held_out_loss"] = distance
     return rows
 
 
-def held_out_losses(
-    settings: dict[str, Any], results: list[np.ndarray]
-) -> list[float] | list[None]:
-    """Loss of each result (vertices, 3) at the style bank's views over the source's loss there.
+def held_out_losses(run: Path, results: list[np.ndarray]) -> list[float] | list[None]:
+    """Loss of each result (vertices, 3) at the style bank's views over the source's loss there,
+    with the settings and the files of ``run``. Raises `UserError` where those have changed.
 
     None for all where the results were saved with more vertices than the source, split at seams.
     """
     import torch
-    from omegaconf import OmegaConf
 
-    from styleexp import compose, styles
+    from styleexp import compose, origins, records, styles
     from styleexp.scene import prepare
 
     compose.register()
-    config = compose.typed(OmegaConf.create(settings))
+    config = origins.restored(records.read_record(run, "compare"), run, "compare")
     config.optim.seed += HELD_OUT_SEED  # local views of one seed all come from one bank of cameras
     scene = prepare(config)
     if any(len(vertices) != len(scene.source.vertices) for vertices in results):

@@ -42,7 +42,7 @@ def job_key(config: Config) -> str:
         part = getattr(config, kind)
         try:
             path = sources.locate(kind, part.name, part.path)
-            files[kind] = _sha256(path) if path else None
+            files[kind] = sha256(path) if path else None
         except UserError:  # the run will say so
             files[kind] = ABSENT
     return _hash(asdict(config), files, __version__)
@@ -81,7 +81,29 @@ def _hash(config: Mapping[str, Any], files: Mapping[str, str | None], version: s
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def _sha256(path: Path) -> str:
+def sha256(path: Path) -> str:
+    """The sha256 of a file, `ABSENT` where there is none; of a ``.gltf`` with buffers beside it,
+    where its geometry lies, that of all their sha256."""
+    found = [_of_file(path), *map(_of_file, _buffers(path))]
+    return found[0] if len(found) == 1 else hashlib.sha256("".join(found).encode()).hexdigest()
+
+
+def _buffers(path: Path) -> list[Path]:
+    if path.suffix.lower() != ".gltf":
+        return []
+    from styleexp.meshes import references
+
+    try:
+        content = json.loads(path.read_bytes())
+        names = [each["uri"] for each in content.get("buffers", []) if "uri" in each]
+        found = [references.find(name, path.parent, path.parent)[0] for name in names
+                 if not name.startswith("data:")]  # fmt: skip
+    except (OSError, ValueError, RecursionError, TypeError, AttributeError):
+        return []  # it can't be read as a mesh, either
+    return [each for each in found if each is not None]
+
+
+def _of_file(path: Path) -> str:
     try:
         known = path.stat()
     except OSError:

@@ -87,6 +87,7 @@ def _job(config: DictConfig) -> float | None:
     A job of a sweep never raises for its own failure, so that the others go on; its folder tells.
     Those of a search do, as it counts them, and return what it minimises.
     """
+    from contextlib import chdir
     from pathlib import Path
 
     from hydra.core.hydra_config import HydraConfig
@@ -107,7 +108,8 @@ def _job(config: DictConfig) -> float | None:
         typed = compose.typed(config)
         typed.threads = typed.threads or launchers.threads_each(runtime)
         folder = Path(runtime.runtime.output_dir)
-        code = run(typed, folder, list(runtime.overrides.task), again=not numbered)
+        with chdir(runtime.runtime.cwd):  # hydra.job.chdir leaves what was typed as it was meant
+            code = run(typed, folder, list(runtime.overrides.task), again=not numbered)
     except UserError as error:
         if config.debug or in_search:
             raise

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import re
+import shlex
 import signal
 import sys
 import time
@@ -13,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from styleexp import atomic, identity, locks, records
+from styleexp import atomic, identity, locks, origins, records
 from styleexp.errors import UserError
 from styleexp.reports import runs
 from styleexp.sweeps.claim import PATIENCE, busy
@@ -60,7 +61,7 @@ def begin(config: Config, folder: Path, overrides: list[str]) -> int:
     Where the folder holds the same run, begun and not finished, it is resumed: so a job that a
     cluster requeues goes on.
     """
-    record = records.describe(config, overrides, ["styleexp", *overrides])
+    record = records.describe(config, overrides, ["styleexp", *overrides]) | origins.noted(config)
     run_folder = records.RunFolder(folder)
     unfinished = run_folder.unfinished(record)
     if unfinished is None:
@@ -70,10 +71,8 @@ def begin(config: Config, folder: Path, overrides: list[str]) -> int:
 
 def resume(folder: Path) -> int:
     """Go on with an interrupted run from its checkpoint."""
-    from styleexp import compose
-
     record = records.read_record(folder)
-    config = compose.recorded(record.get("config"))
+    config = origins.restored(record, folder, "resume", print)
     if changed := records.changed_versions(record):
         print(f"note: the run was begun with {changed}: what follows may differ in its digits")
     with _alone(folder):
@@ -187,7 +186,7 @@ def _fail(folder: records.RunFolder, reason: str) -> None:
 def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resumed: bool) -> int:
     import torch
 
-    from styleexp import assets, baselines, metrics, plugins, sources
+    from styleexp import assets, baselines, metrics, plugins
     from styleexp.config import check
     from styleexp.loggers import Loggers
     from styleexp.scene import Scene
@@ -208,6 +207,13 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
     scene = method.prepare(config)
     for note in scene.notes:
         print(f"note: {note}")
+    read = origins.describe(config)
+    for kind, before in (record.get("assets") or {}).items():
+        if before["sha256"] != read[kind]["sha256"]:
+            raise UserError(
+                f"the {kind} '{read[kind]['path']}' was changed while it was being read: start "
+                "the run anew."
+            )
     state = method.start(scene)
     if resumed and state is not None:
         told = folder.load_checkpoint(state)
@@ -221,7 +227,7 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
         "device": str(scene.surface.vertices.device),
         "threads": torch.get_num_threads(),
         "chosen": {"sigma": scene.sigma, "bound": scene.bound, "relief": scene.relief},
-        "assets": sources.describe(config),
+        "assets": record.get("assets") or read,
         "notes": list(scene.notes),
         "judge": judge,
     }
@@ -265,7 +271,8 @@ def _optimise(
             if interrupted and state.step < optim.steps:
                 folder.write_status("interrupted", step=state.step)
                 loggers.ended = "interrupted"
-                print(f"\nstopped at step {state.step}; go on with: styleexp resume={folder.path}")
+                again = shlex.join(["styleexp", f"resume={folder.path.absolute()}"])
+                print(f"\nstopped at step {state.step}; go on with: {again}")
                 return False
     if folder.checkpoint_step() != state.step:
         folder.save_checkpoint(state)
@@ -323,7 +330,8 @@ def _measure(result: Result, config: Config) -> dict[str, float]:
 
 @contextmanager
 def _interruptible() -> Iterator[list[int]]:
-    """A list that a first Ctrl-C (or SIGTERM) fills; a second one stops at once."""
+    """A list that a first Ctrl-C (or SIGTERM, or a closed terminal) fills; a second one stops at
+    once."""
     caught: list[int] = []
 
     def note(number: int, frame: Any) -> None:
@@ -331,7 +339,12 @@ def _interruptible() -> Iterator[list[int]]:
             raise KeyboardInterrupt
         caught.append(number)
 
-    before = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
+    signals = [signal.SIGINT, signal.SIGTERM]
+    # Windows has no SIGHUP, and under nohup it is to be ignored.
+    hangup = getattr(signal, "SIGHUP", None)
+    if hangup is not None and signal.getsignal(hangup) is not signal.SIG_IGN:
+        signals.append(hangup)
+    before = {s: signal.signal(s, note) for s in signals}
     try:
         yield caught
     finally:

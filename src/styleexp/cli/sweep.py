@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -67,6 +68,16 @@ def _run(options: argparse.Namespace) -> int:
 
     read = plan.read(options.plan)
     folder = options.folder or Path("outputs") / options.plan.stem
+    home = manifest.home(folder)
+    if home is not None and home.absolute() != Path.cwd():
+        if not home.is_dir():
+            raise UserError(
+                f"the plan in '{folder}' was begun in '{home}', from where its files are named, "
+                "and that folder is gone: put it back, or choose another --folder."
+            )
+        print(f"note: files are named from '{home}', where this plan was begun.", flush=True)
+        options.plan, folder = options.plan.absolute(), folder.absolute()
+        os.chdir(home)
     own = [each for each in options.overrides if each.startswith("hydra.")]
     launcher = launchers.overrides(options.launcher or read.launcher, options.jobs) + own
     chosen = [each for each in options.overrides if not each.startswith("hydra.")]

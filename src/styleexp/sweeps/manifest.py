@@ -87,5 +87,15 @@ def update(folder: Path, name: str, state: str) -> dict[str, dict[str, Any]]:
         return jobs
 
 
+def home(folder: Path) -> Path | None:
+    """The working folder in which a plan was begun, that its relative paths start from."""
+    try:
+        return Path(json.loads((folder / NAME).read_text(encoding="utf-8"))["begun_in"])
+    except (OSError, ValueError, KeyError, TypeError):  # or an earlier version's
+        return None
+
+
 def _write(folder: Path, jobs: dict[str, dict[str, Any]]) -> None:
-    records.RunFolder(folder).write_json(NAME, {"schema": SCHEMA, "jobs": jobs})
+    begun_in = str(home(folder) or Path.cwd())
+    content = {"schema": SCHEMA, "begun_in": begun_in, "jobs": jobs}
+    records.RunFolder(folder).write_json(NAME, content)

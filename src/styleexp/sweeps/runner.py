@@ -165,6 +165,8 @@ def task(config: DictConfig) -> None:
 
     Skips what another runner does or did in the meantime. Never raises for the job's own failure.
     """
+    from contextlib import chdir
+
     from hydra.core.hydra_config import HydraConfig
 
     from styleexp import compose
@@ -175,7 +177,7 @@ def task(config: DictConfig) -> None:
     name, overrides = str(runtime.sweep.subdir), tuple(runtime.overrides.task)
     compose.register()
     try:
-        with AT_WORK, locks.hold(folder):
+        with AT_WORK, locks.hold(folder), chdir(runtime.runtime.cwd):  # see hydra.job.chdir
             # No key: somebody removed the manifest, which the runner then writes anew.
             key = manifest.read(root).get(name, {}).get("key")
             job = Job(name, overrides, folder, key)
