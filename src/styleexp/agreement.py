@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from styleexp import atomic
+from styleexp.errors import UserError
 from styleexp.reports import runs
 from styleexp.sweeps import report
 
@@ -54,7 +55,7 @@ def compare(folder: Path) -> list[dict[str, Any]]:
         found, run = runs.of_job(job), job.folder
         named = [o.partition("=")[2] for o in job.overrides if o.startswith("renderer=")]
         row = {
-            "run": run.name,
+            "run": str(run.relative_to(folder)),
             "renderer": found.get("config.renderer.name", "".join(named[-1:])),
             "status": found["status"],
         }
@@ -81,7 +82,11 @@ def compare(folder: Path) -> list[dict[str, Any]]:
         difference = np.abs(pictures[-1][1].astype(float) - pictures[0][1].astype(float))
         row["picture"] = float(difference.mean() / 255)
     _draw(pictures, folder / "figure.png")
-    distances = held_out_losses(folder / results[0][0]["run"], [v for _, v, *_ in results])
+    try:
+        distances = held_out_losses(folder / results[0][0]["run"], [v for _, v, *_ in results])
+    except UserError as error:  # a file of the first run has changed: the rest can be told
+        print(f"note: held_out_loss is not measured: {error}")
+        distances = [None] * len(results)
     for (row, *_), distance in zip(results, distances, strict=True):
         row["held_out_loss"] = distance
     return rows
