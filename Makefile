@@ -4,9 +4,10 @@
 # make docs   the documentation, to site/index.html; warnings are errors
 # make conformance   write docs/conformance.md from the checks of every renderer
 # make stress   all that takes long: kill runners and workers of sweeps ten times each, with every
-#               local launcher; random meshes, files, overrides and renders, STRESS_FUZZ times as many
-#               as in CI; every fault of benchmarks/faults.py; benchmarks/long_haul.py. Each of the
-#               last three gets STRESS_SECONDS. (make stress-sweeps stress-fuzz stress-faults
+#               local launcher; start two sweeps at once twenty times each way; random meshes,
+#               files, overrides and renders, STRESS_FUZZ times as many as in CI; every fault of
+#               benchmarks/faults.py; benchmarks/long_haul.py. Each of the last three gets
+#               STRESS_SECONDS. (make stress-sweeps stress-folders stress-fuzz stress-faults
 #               stress-long: one of them)
 # make matrix   install and run as wheel, editable, with the oldest and the newest dependencies, on
 #               every Python that is here (noxfile.py)
@@ -32,8 +33,8 @@ export OMP_WAIT_POLICY ?= PASSIVE
 # Named meshes and images, where there are some beside the checkout.
 export STYLEEXP_ASSETS ?= $(wildcard $(abspath ../shared))
 
-.PHONY: demo test lint docs conformance stress stress-sweeps stress-fuzz stress-faults stress-long \
-	matrix sbom audit bench-guard ray-test clean
+.PHONY: demo test lint docs conformance stress stress-sweeps stress-folders stress-fuzz stress-faults \
+	stress-long matrix sbom audit bench-guard ray-test clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -55,10 +56,13 @@ docs: $(VENV)/.installed-dev
 conformance: $(VENV)/.installed-dev
 	$(BIN)/python -m styleexp.testing > docs/conformance.md
 
-stress: stress-sweeps stress-fuzz stress-faults stress-long
+stress: stress-sweeps stress-folders stress-fuzz stress-faults stress-long
 
 stress-sweeps: $(VENV)/.installed-dev
 	STYLEEXP_KILLS=10 OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/test_sweeps.py -k kill_9
+
+stress-folders: $(VENV)/.installed-dev
+	STYLEEXP_PAIRS=20 OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/test_folders.py -k two_sweeps
 
 stress-faults: $(VENV)/.installed-dev
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/faults.py --seconds $(STRESS_SECONDS)

@@ -12,7 +12,7 @@ from styleexp import bake, meshes
 from styleexp.cli.bake import main
 from styleexp.compose import recorded
 from styleexp.meshes import load_mesh, vertex_normals
-from styleexp.sources import describe
+from styleexp.origins import describe
 
 SIZE = 256
 

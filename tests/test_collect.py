@@ -17,6 +17,7 @@ def make_run(folder, status="done", **more):
     folder.mkdir(parents=True)
     record = {
         "schema": 1,
+        "overrides": ["a=1"],
         "config": {"source": {"name": "spot", "path": None}, "optim": {"steps": 4, "rate": 2e-3},
                    "loss": {"layers": ["conv1_1", "conv2_1"]}, "shading": {"background": "white"}},
         "versions": {"torch": "2.13.0"},

@@ -147,6 +147,7 @@ def test_a_job_that_never_began_is_missing_and_fails_the_sweep(tmp_path):
     (tmp_path / "jobs.json").write_text(json.dumps({"jobs": [["style=bubble"], ["style=rail"]]}))
     (tmp_path / "0").mkdir()
     (tmp_path / "0" / "status.json").write_text('{"status": "done", "seconds": 3.0}')
+    (tmp_path / "0" / "run.json").write_text('{"overrides": ["style=bubble"]}')
     assert report.exit_code(tmp_path) == 2
     rows = report.table(report.planned(tmp_path))
     assert [row["status"] for row in rows] == ["done", "missing"]

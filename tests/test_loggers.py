@@ -12,8 +12,8 @@ from PIL import Image
 from styleexp import compose, plugins, records
 from styleexp.cli import run as command
 from styleexp.errors import UserError
+from styleexp.identity import essence, job_key
 from styleexp.loggers import Loggers
-from styleexp.sweeps.plan import job_key
 
 SMOKE = (
     "source=torus", "style=bubble", "profile=smoke", "encoder=vgg19_random", "report=false",
@@ -159,7 +159,7 @@ def test_loggers_do_not_make_another_job(tmp_path):
     told = compose.compose([*SMOKE, "logger=tensorboard", "logger.tensorboard.mesh=false"])
     assert told.logger["tensorboard"].mesh is False
     assert job_key(told) == job_key(plain)
-    assert records.essence(vars(told)).keys() == records.essence(vars(plain)).keys()
+    assert essence(vars(told)).keys() == essence(vars(plain)).keys()
     assert job_key(compose.compose([*SMOKE, "strength=0.5"])) != job_key(plain)
 
 

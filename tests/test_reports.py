@@ -196,7 +196,7 @@ def test_a_source_that_has_changed_since_is_not_shown(finished, tmp_path):
         (tmp_path / name).write_bytes((finished / name).read_bytes())
     (tmp_path / "run.json").write_text(json.dumps(record))
     text = page.rewrite(tmp_path).read_text()
-    assert "its file has changed since the run" in text
+    assert "has changed since the run began" in text
     assert set(blocks(text)) == {"viewer-code", "glb-style", "glb-result"}
 
 

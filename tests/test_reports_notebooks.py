@@ -205,7 +205,8 @@ def test_a_plan_of_pairs_half_done_has_one_column_of_pairs(tmp_path):
     pairs = ("torus_bubble", "sphere_stripe", "hand_wave_large")
     given = {pair: [f"+pair={pair}", "+experiment=board"] for pair in pairs}
     for pair in pairs[:2]:
-        write_run(tmp_path / "board" / pair, [*given[pair], *_parts(pair)])
+        given[pair] += _parts(pair)
+        write_run(tmp_path / "board" / pair, given[pair])
     jobs = {f"board/{pair}": {"state": "missing", "overrides": given[pair]} for pair in pairs}
     (tmp_path / "manifest.json").write_text(json.dumps({"schema": 1, "jobs": jobs}))
     frame = notebook.runs(tmp_path, "board")

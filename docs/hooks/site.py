@@ -28,9 +28,9 @@ API = {
                   "renderers.mitsuba_ad", "renderers.moderngl_deferred", "testing"),
     "Encoders": ("encoders", "encoders.vgg", "encoders.fused", "encoders.clip", "encoders.weights"),
     "Parts and plugins": ("registry", "plugins", "loggers", "errors"),
-    "Runs, metrics, reports": ("records", "metrics", "metrics.style", "metrics.shape",
+    "Runs, metrics, reports": ("records", "identity", "origins", "metrics", "metrics.style", "metrics.shape",
                                "metrics.truth", "reports", "reports.collect",
-                               "reports.reliability", "reports.study_results", "sweeps.plan", "sweeps.runner", "agreement", "remembered", "bench.render", "bench.step"),
+                               "reports.reliability", "reports.study_results", "sweeps.claim", "sweeps.plan", "sweeps.runner", "agreement", "remembered", "bench.render", "bench.step"),
 }  # fmt: skip
 COMMANDS = ("styleexp-assets", "styleexp-bake", "styleexp-bench", "styleexp-metrics",
             "styleexp-plugins", "styleexp-report", "styleexp-report study", "styleexp-sweep")  # fmt: skip

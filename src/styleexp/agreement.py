@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from styleexp import atomic
+from styleexp.errors import UserError
+from styleexp.reports import runs
 from styleexp.sweeps import report
 
 if TYPE_CHECKING:
@@ -37,7 +39,7 @@ class OnSweepEnd(report.OnSweep):
 
 
 def compare(folder: Path) -> list[dict[str, Any]]:
-    """One row for each run below ``folder``, in the order of the jobs; draws ``figure.png``.
+    """One row for each job of the sweep in ``folder``, in their order; draws ``figure.png``.
 
     ``distance`` is the root mean square distance of the result's vertices from the first run's, as
     a share of the first's root mean square displacement; ``correlation`` that of both
@@ -49,18 +51,17 @@ def compare(folder: Path) -> list[dict[str, Any]]:
     import numpy as np
 
     rows, results = [], []
-    runs = [path.parent for path in folder.glob("*/run.json")]
-    for run in sorted(runs, key=lambda path: (len(path.name), path.name)):
-        record = json.loads((run / "run.json").read_text(encoding="utf-8"))
-        status = json.loads((run / "status.json").read_text(encoding="utf-8"))
+    for job in report.planned(folder):
+        found, run = runs.of_job(job), job.folder
+        named = [o.partition("=")[2] for o in job.overrides if o.startswith("renderer=")]
         row = {
-            "run": run.name,
-            "renderer": record["config"]["renderer"]["name"],
-            "status": status["status"],
+            "run": str(run.relative_to(folder)),
+            "renderer": found.get("config.renderer.name", "".join(named[-1:])),
+            "status": found["status"],
         }
         rows.append(row)
-        if status["status"] != "done":
-            row["reason"] = status.get("reason", "")
+        if found["status"] != "done":
+            row["reason"] = found["reason"] or ""
             continue
         lines = (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
         steps = [json.loads(line) for line in lines]
@@ -81,26 +82,28 @@ def compare(folder: Path) -> list[dict[str, Any]]:
         difference = np.abs(pictures[-1][1].astype(float) - pictures[0][1].astype(float))
         row["picture"] = float(difference.mean() / 255)
     _draw(pictures, folder / "figure.png")
-    settings = json.loads((folder / results[0][0]["run"] / "run.json").read_text(encoding="utf-8"))
-    distances = held_out_losses(settings["config"], [vertices for _, vertices, *_ in results])
+    try:
+        distances = held_out_losses(folder / results[0][0]["run"], [v for _, v, *_ in results])
+    except UserError as error:  # a file of the first run has changed: the rest can be told
+        print(f"note: held_out_loss is not measured: {error}")
+        distances = [None] * len(results)
     for (row, *_), distance in zip(results, distances, strict=True):
         row["held_out_loss"] = distance
     return rows
 
 
-def held_out_losses(
-    settings: dict[str, Any], results: list[np.ndarray]
-) -> list[float] | list[None]:
-    """Loss of each result (vertices, 3) at the style bank's views over the source's loss there.
+def held_out_losses(run: Path, results: list[np.ndarray]) -> list[float] | list[None]:
+    """Loss of each result (vertices, 3) at the style bank's views over the source's loss there,
+    with the settings and the files of ``run``. Raises `UserError` where those have changed.
 
     None for all where the results were saved with more vertices than the source, split at seams.
     """
     import torch
 
-    from styleexp import compose, styles
+    from styleexp import origins, records, styles
     from styleexp.scene import prepare
 
-    config = compose.recorded(settings)
+    config = origins.restored(records.read_record(run, "compare"), run, "compare")
     config.optim.seed += HELD_OUT_SEED  # local views of one seed all come from one bank of cameras
     scene = prepare(config)
     if any(len(vertices) != len(scene.source.vertices) for vertices in results):

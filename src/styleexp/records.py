@@ -18,7 +18,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from styleexp import atomic, digests, plugins
+from styleexp import atomic, digests, identity, plugins
 from styleexp.errors import UserError
 from styleexp.layout import SCHEMA, too_new
 
@@ -97,7 +97,7 @@ class RunFolder:
             raise UserError(f"cannot run in '{self.path}': {told}")
         try:
             status = json.loads((self.path / "status.json").read_text(encoding="utf-8"))
-            same = status["status"] != "done" and _same(before, record)
+            same = status["status"] != "done" and identity.of(before) == record["key"]
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return None
         return before if same else None
@@ -201,22 +201,9 @@ class RunFolder:
         return f"{', and '.join(damaged)}; {used}."
 
 
-def essence(config: Mapping[str, Any]) -> Any:
-    """A run's configuration as plain JSON, without what its result doesn't follow from."""
-    aside = ("threads", "debug", "logger", "report")
-    kept = {key: value for key, value in config.items() if key not in aside}
-    return json.loads(json.dumps(kept, default=str))
-
-
 def first_line(error: BaseException) -> str:
     """What an exception says, in one line."""
     return (str(error).strip().splitlines() or [""])[0] or type(error).__name__
-
-
-def _same(before: Mapping[str, Any], now_: Mapping[str, Any]) -> bool:
-    """Whether two records are of the same run by the same version."""
-    versions = [each["versions"].get("styleexp") for each in (before, now_)]
-    return essence(before["config"]) == essence(now_["config"]) and versions[0] == versions[1]
 
 
 def _restore(path: Path, state: State) -> None:
@@ -246,6 +233,7 @@ def describe(config: Any, overrides: list[str], command: list[str]) -> dict[str,
     """What a reader needs to reproduce a run, apart from what the run itself finds out."""
     return {
         "schema": SCHEMA,
+        "key": identity.job_key(config),
         "started": now(),
         "command": command,
         "overrides": overrides,

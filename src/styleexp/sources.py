@@ -134,17 +134,3 @@ def _load(kind: str, name: str | None, path: str | None) -> meshes.Mesh | np.nda
             f"({', '.join(assets.SUFFIXES['mesh'])}) or a picture ({', '.join(IMAGE_SUFFIXES)})."
         )
     return meshes.load_mesh(found)
-
-
-def describe(config: Config) -> dict[str, dict[str, str | None]]:
-    """Name, file and sha256 of the source and style, for the run's record; analytic shapes have no
-    file, their definition is this version's."""
-    found = {}
-    for kind, part in (("source", config.source), ("style", config.style)):
-        path = locate(kind, part.name, part.path)
-        found[kind] = {
-            "name": part.name,
-            "path": str(path) if path else None,
-            "sha256": assets.sha256(path) if path else None,
-        }
-    return found

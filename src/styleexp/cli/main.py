@@ -123,6 +123,7 @@ def _job(config: DictConfig) -> float | None:
     A job of a sweep never raises for its own failure, so that the others go on; its folder tells.
     Those of a search do, as it counts them, and return what it minimises.
     """
+    from contextlib import chdir
     from pathlib import Path
 
     from hydra.core.hydra_config import HydraConfig
@@ -135,15 +136,18 @@ def _job(config: DictConfig) -> float | None:
 
     runtime = HydraConfig.get()
     in_search = objective.LEAST_IOU in os.environ
-    in_sweep = not OmegaConf.is_missing(runtime.job, "num") and not in_search
+    numbered = not OmegaConf.is_missing(runtime.job, "num")
+    in_sweep = numbered and not in_search
     compose.register()  # a launcher's process has not done so
     code = 0
     try:
         typed = compose.typed(config)
         typed.threads = typed.threads or launchers.threads_each(runtime)
+        folder = Path(runtime.runtime.output_dir)
         # As they are in Hydra's grammar: resolved, an escaped "${" in a file's name would be lost.
         given: Any = OmegaConf.to_container(runtime.overrides.task, resolve=False)
-        code = run(typed, Path(runtime.runtime.output_dir), given)
+        with chdir(runtime.runtime.cwd):  # hydra.job.chdir leaves what was typed as it was meant
+            code = run(typed, folder, given, again=not numbered)
     except UserError as error:
         if config.debug or in_search:
             raise
@@ -158,7 +162,7 @@ def _job(config: DictConfig) -> float | None:
         raise KeyboardInterrupt
     if code and not in_sweep:
         sys.exit(code)
-    return objective.objective(Path(runtime.runtime.output_dir)) if in_search else None
+    return objective.objective(folder) if in_search else None
 
 
 def _list_groups_once() -> None:

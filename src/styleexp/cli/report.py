@@ -46,7 +46,9 @@ def report(given: list[str]) -> list[Path]:
     from styleexp.reports import folders, page, sweep_page
 
     if folders.is_run(options.folder):
-        written = page.rewrite(options.folder)
+        written = page.rewrite(
+            options.folder, lambda told: print(f"styleexp-report: note: {told}", file=sys.stderr)
+        )
     else:
         written = sweep_page.write(options.folder, not options.no_run_pages)
     if options.open:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import signal
 import sys
 import time
@@ -11,9 +12,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from styleexp import atomic, locks, process, records
+from styleexp import atomic, identity, locks, origins, process, records
 from styleexp.errors import UserError
+from styleexp.reports import runs
 from styleexp.stages import announced, doing
+from styleexp.sweeps.claim import PATIENCE, busy
+from styleexp.sweeps.jobs import Job
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -27,13 +31,26 @@ if TYPE_CHECKING:
 
 SHOWN_METRICS = ("style_distance", "silhouette_iou", "flipped_faces", "spike")
 """What is printed of metrics.json."""
-LOCK_PATIENCE = 2.0
-"""Seconds to wait for a folder: who only looks whether it is held, holds it for a moment."""
 
 
-def run(config: Config, folder: Path, overrides: list[str]) -> int:
-    """Stylise and write everything into ``folder``; returns the exit code."""
+def run(config: Config, folder: Path, overrides: list[str], again: bool = True) -> int:
+    """Stylise and write everything into ``folder``; returns the exit code.
+
+    Unless ``again``, as in a sweep, a run that is done is not done again, and another run in the
+    folder is refused, not replaced, unless it failed.
+    """
     with _alone(folder):
+        if not again:
+            job = Job(folder.name, tuple(overrides), folder, identity.job_key(config))
+            found = runs.of_job(job)
+            if found["status"] == "done":
+                print(f"already done: {folder}")
+                return 0
+            if found["status"] == "other" and runs.status(folder) != "failed":
+                raise UserError(
+                    f"'{folder}' is not this job's, {found['reason']}: choose another folder with "
+                    "hydra.sweep.dir=FOLDER, or remove it."
+                )
         return begin(config, folder, overrides)
 
 
@@ -43,11 +60,9 @@ def begin(config: Config, folder: Path, overrides: list[str]) -> int:
     Where the folder holds the same run, begun and not finished, it is resumed: so a job that a
     cluster requeues goes on.
     """
-    record = records.describe(config, overrides, ["styleexp", *overrides])
+    record = records.describe(config, overrides, ["styleexp", *overrides]) | origins.noted(config)
     run_folder = records.RunFolder(folder)
     unfinished = run_folder.unfinished(record)
-    if unfinished is not None and not _same_assets(unfinished, config):
-        unfinished = None
     if unfinished is None:
         run_folder.clear()
     return _guarded(config, run_folder, unfinished or record, resumed=unfinished is not None)
@@ -55,42 +70,22 @@ def begin(config: Config, folder: Path, overrides: list[str]) -> int:
 
 def resume(folder: Path) -> int:
     """Go on with an interrupted run from its checkpoint."""
-    from styleexp import compose
-
     record = records.read_record(folder)
-    config = compose.recorded(record.get("config"))
+    config = origins.restored(record, folder, "resume", print)
     if changed := records.changed_versions(record):
         print(f"note: the run was begun with {changed}: what follows may differ in its digits")
     with _alone(folder):
         return _guarded(config, records.RunFolder(folder), record, resumed=True)
 
 
-def _same_assets(record: dict[str, Any], config: Config) -> bool:
-    """Whether source and style are the files that a run began with."""
-    from styleexp import sources
-
-    try:
-        return record.get("assets") in (None, sources.describe(config))
-    except UserError:  # the run itself will say so
-        return False
-
-
 @contextmanager
 def _alone(folder: Path) -> Iterator[None]:
     """Hold the folder's lock: two processes in one folder would mix their files."""
     try:
-        with locks.hold(folder, LOCK_PATIENCE):
+        with locks.hold(folder, PATIENCE):
             yield
     except locks.Busy:
         raise UserError(busy(folder)) from None
-
-
-def busy(folder: Path) -> str:
-    """What is said of a folder that another process holds."""
-    return (
-        f"another process is at work in '{folder}': wait for it, or choose another folder with "
-        "hydra.run.dir=FOLDER."
-    )
 
 
 def _guarded(
@@ -166,7 +161,7 @@ def _fail(folder: records.RunFolder, reason: str) -> None:
 def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resumed: bool) -> int:
     import torch
 
-    from styleexp import assets, baselines, metrics, plugins, sources
+    from styleexp import assets, baselines, metrics, plugins
     from styleexp.config import check
     from styleexp.loggers import Loggers
     from styleexp.scene import Scene
@@ -188,6 +183,13 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
     doing("")
     for note in scene.notes:
         print(f"note: {note}")
+    read = origins.describe(config)
+    for kind, before in (record.get("assets") or {}).items():
+        if before["sha256"] != read[kind]["sha256"]:
+            raise UserError(
+                f"the {kind} '{read[kind]['path']}' was changed while it was being read: start "
+                "the run anew."
+            )
     state = method.start(scene)
     if resumed and state is not None:
         told = folder.load_checkpoint(state)
@@ -201,7 +203,7 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
         "device": str(scene.surface.vertices.device),
         "threads": torch.get_num_threads(),
         "chosen": {"sigma": scene.sigma, "bound": scene.bound, "relief": scene.relief},
-        "assets": sources.describe(config),
+        "assets": record.get("assets") or read,
         "notes": list(scene.notes),
         "judge": judge,
     }
@@ -246,7 +248,8 @@ def _optimise(
             if interrupted and state.step < optim.steps:
                 folder.write_status("interrupted", step=state.step)
                 loggers.ended = "interrupted"
-                print(f"\nstopped at step {state.step}; go on with: styleexp resume={folder.path}")
+                again = shlex.join(["styleexp", f"resume={folder.path.absolute()}"])
+                print(f"\nstopped at step {state.step}; go on with: {again}")
                 return False
     if folder.checkpoint_step() != state.step:
         folder.save_checkpoint(state)
@@ -308,7 +311,8 @@ def _measure(result: Result, config: Config) -> dict[str, float]:
 
 @contextmanager
 def _interruptible() -> Iterator[list[int]]:
-    """A list that a first Ctrl-C (or SIGTERM) fills; a second one stops at once."""
+    """A list that a first Ctrl-C (or SIGTERM, or a closed terminal) fills; a second one stops at
+    once."""
     caught: list[int] = []
 
     def note(number: int, frame: Any) -> None:
@@ -316,7 +320,12 @@ def _interruptible() -> Iterator[list[int]]:
             raise KeyboardInterrupt
         caught.append(number)
 
-    before = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
+    signals = [signal.SIGINT, signal.SIGTERM]
+    # Windows has no SIGHUP, and under nohup it is to be ignored.
+    hangup = getattr(signal, "SIGHUP", None)
+    if hangup is not None and signal.getsignal(hangup) is not signal.SIG_IGN:
+        signals.append(hangup)
+    before = {s: signal.signal(s, note) for s in signals}
     try:
         yield caught
     finally:

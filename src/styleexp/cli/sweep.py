@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -67,6 +68,16 @@ def _run(options: argparse.Namespace) -> int:
 
     read = plan.read(options.plan)
     folder = options.folder or Path("outputs") / options.plan.stem
+    home = manifest.home(folder)
+    if home is not None and home.absolute() != Path.cwd():
+        if not home.is_dir():
+            raise UserError(
+                f"the plan in '{folder}' was begun in '{home}', from where its files are named, "
+                "and that folder is gone: put it back, or choose another --folder."
+            )
+        print(f"note: files are named from '{home}', where this plan was begun.", flush=True)
+        options.plan, folder = options.plan.absolute(), folder.absolute()
+        os.chdir(home)
     own = [each for each in options.overrides if each.startswith("hydra.")]
     launcher = launchers.overrides(options.launcher or read.launcher, options.jobs) + own
     chosen = [each for each in options.overrides if not each.startswith("hydra.")]
@@ -101,7 +112,7 @@ def _report(read: Plan, by_entry: dict[str, list[Planned]], folder: Path) -> int
         title = f"{entry.name} ({entry.figure})" if entry.figure else entry.name
         (folder / entry.name).mkdir(exist_ok=True)
         report(by_entry[entry.name], folder / entry.name, title)
-    states = [runs.read(job.folder)["status"] for jobs in by_entry.values() for job in jobs]
+    states = [runs.of_job(job)["status"] for jobs in by_entry.values() for job in jobs]
     return 0 if set(states) == {"done"} else 2
 
 
@@ -121,7 +132,7 @@ def _show_commands(
         total += minutes or 0
         print(f"# {entry.name}{f', {entry.figure}' if entry.figure else ''}: {cost}")
         for job in by_entry[entry.name]:
-            status = runs.read(job.folder)["status"]
+            status = runs.of_job(job)["status"]
             note = "" if status == "missing" else f"  # {status}"
             note = "  # the same job as above" if job.name in seen else note
             seen.add(job.name)
@@ -135,6 +146,7 @@ def _status(folder: Path) -> int:
 
     from styleexp.reports import runs
     from styleexp.sweeps import manifest
+    from styleexp.sweeps.jobs import Job
 
     jobs = manifest.read(folder)
     if not jobs:
@@ -143,8 +155,12 @@ def _status(folder: Path) -> int:
     for column in ("job", "state", "step", "attempts", "time"):
         table.add_column(column, overflow="fold")
     counts: Counter[str] = Counter()
+    reasons: list[str] = []
     for name, known in jobs.items():
-        run: dict[str, Any] = runs.read(folder / name)
+        job = Job(name, tuple(known.get("overrides", ())), folder / name, known.get("key"))
+        run: dict[str, Any] = runs.of_job(job)
+        if run["reason"]:
+            reasons.append(f"{name}: {run['reason']}")
         state = "outdated" if known["state"] == "outdated" else str(run["status"])
         state = "waiting" if state == "missing" else state
         counts[state] += 1
@@ -161,10 +177,8 @@ def _status(folder: Path) -> int:
         console = Console(width=140)
     console.print(table)
     console.print(", ".join(f"{count} {state}" for state, count in counts.items()))
-    for name in jobs:
-        reason = runs.read(folder / name)["reason"]
-        if reason:
-            console.print(f"{name}: {reason}", markup=False, soft_wrap=True)
+    for reason in reasons:
+        console.print(reason, markup=False, soft_wrap=True)
     return 0
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from styleexp import meshes, records
+from styleexp import meshes, origins, records
 from styleexp.errors import UserError
 from styleexp.metrics import Judge, measure
 from styleexp.metrics.patches import relief_of_result
@@ -28,7 +28,7 @@ def measure_run(folder: Path, judge: Judge | None) -> dict[str, float]:
 
     Raises `UserError` for a folder that is no run's, or whose run isn't done.
     """
-    config, source, style, vertices, faces = _finished(folder)
+    _, config, source, style, vertices, faces = _finished(folder)
     return measure(config, source, style, vertices, faces, judge)
 
 
@@ -45,6 +45,7 @@ def measure_board(folder: Path, judge: Judge, write: bool = False) -> dict[str, 
     rows: list[dict[str, Any]] = []
     results: list[tuple[dict[str, Any], Looks]] = []
     goals: dict[str, Looks] = {}
+    contents: dict[str, str] = {}
     runs = sorted((path.parent for path in folder.rglob("run.json")), key=lambda p: str(p))
     if not runs:
         raise UserError(f"'{folder}' holds no run: give a run's or a sweep's folder.")
@@ -52,11 +53,11 @@ def measure_board(folder: Path, judge: Judge, write: bool = False) -> dict[str, 
         row: dict[str, Any] = {"run": str(run.relative_to(folder))}
         rows.append(row)
         try:
-            config, source, style, vertices, faces = _finished(run)
+            record, config, source, style, vertices, faces = _finished(run)
         except UserError as error:
             row["status"] = str(error)
             continue
-        name = config.style.path or str(config.style.name)
+        name = _style_name(record, contents)
         row |= {"status": "done", "source": source.name, "style": name}
         found = measure(config, source, style, vertices, faces, judge)
         if write:
@@ -82,6 +83,17 @@ def measure_board(folder: Path, judge: Judge, write: bool = False) -> dict[str, 
     }
 
 
+def _style_name(record: dict[str, Any], contents: dict[str, str]) -> str:
+    """The style's name as it was typed; files of one name and different content are told apart.
+
+    ``contents`` holds the content of every name so far, and is added to.
+    """
+    typed = record["config"]["style"]
+    content = str(((record.get("assets") or {}).get("style") or {}).get("sha256"))
+    name = str(typed["path"] or typed["name"])
+    return name if contents.setdefault(name, content) == content else f"{name} ({content[:8]})"
+
+
 def nearest(
     looks: Looks, style: str, goals: dict[str, Looks], distance: Callable[[Looks, Looks], float]
 ) -> str:
@@ -105,10 +117,8 @@ def unit_of(config: Config, source: meshes.Mesh, style: meshes.Mesh | np.ndarray
 
 def _finished(
     folder: Path,
-) -> tuple[Config, meshes.Mesh, meshes.Mesh | np.ndarray, np.ndarray, np.ndarray]:
-    """Configuration, source, style and result of a run that is done."""
-    from styleexp import compose
-
+) -> tuple[dict[str, Any], Config, meshes.Mesh, meshes.Mesh | np.ndarray, np.ndarray, np.ndarray]:
+    """Record, configuration, source, style and result of a run that is done."""
     record = records.read_record(folder, "measure")
     try:
         status = json.loads((folder / "status.json").read_text(encoding="utf-8"))["status"]
@@ -116,9 +126,9 @@ def _finished(
         raise UserError(f"'{folder}/status.json' cannot be read ({error}).") from error
     if status != "done":
         raise UserError(f"the run in '{folder}' is {status}, not done: there is no result yet.")
-    config = compose.recorded(record["config"])
+    config = origins.restored(record, folder, "measure")
     source, style = load_source(config.source), load_style(config.style)
-    return config, source, style, *read_result(folder / "result.ply", source)
+    return record, config, source, style, *read_result(folder / "result.ply", source)
 
 
 def read_result(path: Path, source: meshes.Mesh) -> tuple[np.ndarray, np.ndarray]:

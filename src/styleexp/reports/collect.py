@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from styleexp.errors import UserError
-from styleexp.reports import runs
+from styleexp.reports import folders, runs
 
 if TYPE_CHECKING:
     import pandas
@@ -25,8 +25,8 @@ def collect(folder: str | Path) -> pandas.DataFrame:
     ``loss`` (mean of the last tenth of the steps), ``config.*``, ``metric.*``, ``version.*``,
     ``asset.*`` (sha256), ``experiment`` where a plan names it. ``status`` is the run's own; or
     ``missing``, planned but never begun; ``died``, its process was killed; ``outdated``, its plan
-    was changed since. Keys of lists are JSON. Raises `UserError` without pandas (extra ``report``)
-    and for no folder.
+    was changed since; ``other``, another run lies in the folder of a sweep's or plan's job. Keys of
+    lists are JSON. Raises `UserError` without pandas (extra ``report``) and for no folder.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -35,9 +35,12 @@ def collect(folder: str | Path) -> pandas.DataFrame:
         import pandas
     except ImportError:
         raise UserError("collecting needs pandas: pip install 'styleexp[report]'.") from None
+    asked = {job.folder: job for job in folders.planned(folder)}
     rows = []
-    for run, more in sorted(_runs(folder).items()):
-        rows.append({"run": run, **runs.read(folder / run), **more})
+    for run, more in sorted(_runs(folder, asked).items()):
+        job = asked.get(folder / run)
+        row = runs.read(folder / run) if job is None else runs.of_job(job)
+        rows.append({"run": run, **row, **more})
     frame = pandas.DataFrame(rows, columns=None if rows else list(FIRST))
     rest = sorted(column for column in frame.columns if column not in FIRST)
     return frame.reindex(columns=[*FIRST, *rest])
@@ -63,15 +66,13 @@ def write(frame: pandas.DataFrame, folder: str | Path) -> list[Path]:
     return [target.write("runs.csv", lambda path: frame.to_csv(path, index=False)), parquet]
 
 
-def _runs(folder: Path) -> dict[str, dict[str, str]]:
+def _runs(folder: Path, asked: Iterable[Path]) -> dict[str, dict[str, str]]:
     """The runs that are, or should be, below a folder, and what is known of them from outside."""
     from styleexp.sweeps import manifest
-    from styleexp.sweeps.report import JOBS, planned
 
     found: dict[str, dict[str, str]] = {run: {} for run in _begun(folder)}
-    for path in sorted(folder.rglob(JOBS)):
-        for job in planned(path.parent):
-            found.setdefault(str(job.folder.relative_to(folder)), {})
+    for path in asked:
+        found.setdefault(str(path.relative_to(folder)), {})
     for path in sorted(folder.rglob(manifest.NAME)):
         jobs, below = manifest.read(path.parent), path.parent.relative_to(folder)
         for name, listed in jobs.items():
@@ -87,11 +88,11 @@ def _runs(folder: Path) -> dict[str, dict[str, str]]:
 
 def _begun(folder: Path) -> Iterator[str]:
     """Folders with a run's record or status; a run has no runs below it."""
-    for at, folders, files in os.walk(folder):
+    for at, below, files in os.walk(folder):
         if "status.json" in files or ("run.json" in files and _is_record(Path(at) / "run.json")):
-            folders.clear()
+            below.clear()
             yield str(Path(at).relative_to(folder))
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        below[:] = sorted(name for name in below if not name.startswith("."))
 
 
 def _is_record(path: Path) -> bool:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 import shlex
 import statistics
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import Any
 
-from styleexp import locks
+from styleexp import identity, locks
 from styleexp.errors import UserError
 from styleexp.layout import too_new
+from styleexp.sweeps import jobs
+from styleexp.sweeps.jobs import Job
 
 MARKS = ("run.json", "status.json", ".hydra/overrides.yaml")
 """Files that tell a run's folder; Hydra's is there before the run has a record."""
@@ -37,7 +40,7 @@ class Run:
     def state(self) -> str:
         """``done``, ``running``, ``interrupted``, ``failed``; ``missing`` if it never began,
         ``died`` if it calls itself running and no process is at it, ``newer`` if a later version of
-        styleexp wrote it."""
+        styleexp wrote it, ``other`` if the folder of a sweep's job holds another run."""
         return str(self.status.get("status", "missing"))
 
     @property
@@ -148,17 +151,35 @@ def find(folder: Path) -> list[Run]:
     there with their overrides and the state ``missing``.
     """
     found = {path.parents[m.count("/")]: None for m in MARKS for path in folder.rglob(m)}
-    planned: dict[Path, list[str]] = {}
-    for path in folder.rglob("jobs.json"):
-        for number, overrides in enumerate(_listed(path) or []):
-            planned[path.parent / str(number)] = list(overrides)
+    asked = {job.folder: job for job in planned(folder)}
+    runs = [_of_job(read(path), asked.get(path)) for path in found]
+    runs += [Run(at, overrides=list(j.overrides)) for at, j in asked.items() if at not in found]
+    return sorted(runs, key=lambda run: natural(run.folder, folder))
+
+
+def planned(folder: Path) -> Iterator[Job]:
+    """The jobs that sweeps and plans at or below ``folder`` list, without outdated ones."""
+    for path in folder.rglob(jobs.JOBS):
+        if (jobs.listed(path.parent) or {}).get("jobs"):
+            yield from jobs.planned(path.parent)
     for path in folder.rglob("manifest.json"):
         for name, job in dict(_listed(path) or {}).items():
             if isinstance(job, dict) and job.get("state") != "outdated":
-                planned[path.parent / name] = list(job.get("overrides") or [])
-    runs = [read(path) for path in found]
-    runs += [Run(at, overrides=given) for at, given in planned.items() if at not in found]
-    return sorted(runs, key=lambda run: natural(run.folder, folder))
+                given = tuple(map(str, job.get("overrides") or []))
+                yield Job(name, given, path.parent / name, job.get("key"))
+
+
+def _of_job(run: Run, job: Job | None) -> Run:
+    """What a job's folder holds, if it is the job's; else the job with what is there instead."""
+    if job is None or run.state == "newer" or not (run.record or run.state == "done"):
+        return run
+    state, told = "unreadable", "it has no run.json that can be read"
+    if run.record:
+        state, told = "other", identity.not_of(job.key, job.overrides, run.record) or ""
+        if not told:
+            return run
+    status = {"status": state, "reason": told}
+    return Run(run.folder, status=status, overrides=list(job.overrides), problems=(f"{told}.",))
 
 
 def _listed(path: Path) -> Any:

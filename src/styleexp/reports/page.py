@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import statistics
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,10 +61,15 @@ def write_ended(folder: Path, result: Result, seconds: float) -> Path:
     return write(dataclasses.replace(run, status=status), shows.of(result))
 
 
-def rewrite(folder: Path) -> Path:
-    """The page of a run, finished or not, from what its folder holds."""
+def rewrite(folder: Path, tell: Callable[[str], Any] | None = None) -> Path:
+    """The page of a run, finished or not, from what its folder holds; ``tell`` takes a sentence for
+    each thing that could not be shown."""
     run = folders.readable(folder, "show")
-    return write(run, shows.read(run))
+    shown = shows.read(run)
+    if tell is not None:
+        for told in shown.missing:
+            tell(told)
+    return write(run, shown)
 
 
 def build(run: Run, shown: Shown) -> str:
@@ -189,7 +195,7 @@ def _assets(run: Run) -> list[dict[str, str]]:
         rows.append(
             {
                 "kind": kind,
-                "name": str(row.get("path") or row.get("name")),
+                "name": str(run.config.get(f"{kind}.path") or row.get("name")),
                 "sha256": row.get("sha256") or "–",
                 "origin": origin,
             }

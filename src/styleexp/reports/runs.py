@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from styleexp import locks
+from styleexp import identity, locks
 from styleexp.layout import too_new
+
+if TYPE_CHECKING:
+    from styleexp.sweeps.jobs import Job
 
 FINAL_SHARE = 10
 """The final loss is the mean over the last tenth of the steps."""
@@ -43,6 +46,26 @@ def read(folder: Path) -> dict[str, Any]:
     row |= {f"version.{name}": v for name, v in (record.get("versions") or {}).items()}
     for role, asset in (record.get("assets") or {}).items():
         row[f"asset.{role}"] = asset.get("sha256") or asset.get("name")
+    return row
+
+
+def of_job(job: Job) -> dict[str, Any]:
+    """The same of a job's folder, if what lies there is the job's.
+
+    ``status`` is ``other`` where the folder holds another run, whose numbers aren't told, and
+    ``unreadable`` where a run that ended has no record that tells which it was.
+    """
+    record = _json(job.folder / "run.json", [])
+    row = read(job.folder)
+    bare = {**dict.fromkeys(("status", "seconds", "device", "loss")), "reason": row["reason"]}
+    if row["status"] == "newer":
+        return row
+    if not record:
+        known = row["status"] if row["status"] != "done" else "unreadable"
+        told = row["reason"] or "it has no run.json" if known == "unreadable" else row["reason"]
+        return {**bare, "status": known, "reason": told}
+    if told := identity.not_of(job.key, job.overrides, record):
+        return {**bare, "status": "other", "reason": told}
     return row
 
 

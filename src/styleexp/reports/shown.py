@@ -87,7 +87,7 @@ def of(result: Result) -> Shown:
 
 def read(run: Run) -> Shown:
     """What a run's folder shows. Source and style come from the files that they came from, if those
-    are still the same."""
+    are still the same; which are not is in ``missing``."""
     missing: list[str] = []
     source, style = _load(run, missing)
     found: dict[str, Any] = {}
@@ -137,7 +137,7 @@ def read_moved(folder: Path) -> tuple[meshes.Mesh, np.ndarray, np.ndarray]:
         raise UserError(f"'{folder}' has no result.ply: give the folder of a finished run.")
     source, _ = _load(run, missing)
     if source is None:
-        raise UserError(f"'{folder}' can't be used: {' '.join(missing)}")
+        raise UserError(f"'{folder}' can't be used: {missing[0]}")
     try:
         stored, _, values = read_result(path)
     except Exception as error:  # trimesh raises almost anything on a damaged file
@@ -158,28 +158,25 @@ def read_moved(folder: Path) -> tuple[meshes.Mesh, np.ndarray, np.ndarray]:
 
 def _load(run: Run, missing: list[str]) -> tuple[meshes.Mesh | None, Any]:
     """Source and style of a run's record, None where they can't be had as they were."""
-    from styleexp import compose, sources
+    from styleexp import compose, origins, sources
 
     if not run.record.get("config"):
         missing.append("Source and style can't be shown: there is no readable run.json.")
         return None, None
     try:
         config = compose.recorded(run.record["config"])
-        now = sources.describe(config)
     except Exception as error:
         missing.append(f"Source and style can't be shown: {error}")
         return None, None
-    then = run.record.get("assets") or {}
     loaders: dict[str, Any] = {
         "source": lambda: sources.load_source(config.source),
         "style": lambda: sources.load_style(config.style),
     }
     found: dict[str, Any] = {}
     for kind, load in loaders.items():
-        if (then.get(kind) or {}).get("sha256") != now[kind]["sha256"]:
-            missing.append(f"The {kind} can't be shown: its file has changed since the run.")
-            continue
         try:
+            if path := origins.find(run.record, config, kind, run.folder):
+                getattr(config, kind).path = str(path)
             found[kind] = load()
         except UserError as error:
             missing.append(f"The {kind} can't be shown: {error}")

@@ -116,7 +116,8 @@ def write_figure(jobs: Sequence[Job], folder: RunFolder) -> None:
     """Draw ``figure.png`` of the first `MOST` jobs; one without a result has its status in the
     picture's place."""
     told = varying([job.overrides for job in jobs])
-    configs = [_config(job) for job in jobs[:MOST]]
+    records = [_record(job) for job in jobs[:MOST]]
+    configs = [_config(job, record) for job, record in zip(jobs[:MOST], records, strict=True)]
     shown = [
         Shown(_name(config.source), _name(config.style), setting(overrides))
         for config, overrides in zip(configs, told[:MOST], strict=True)
@@ -128,10 +129,13 @@ def write_figure(jobs: Sequence[Job], folder: RunFolder) -> None:
 
     def picture(cell: Cell) -> Image.Image | str:
         config = configs[cell.job]
-        part = config.source if cell.kind == "source" else config.style
-        key = (cell.kind, repr(part)) if cell.kind != "result" else (cell.kind, cell.job)
+        record = records[cell.job]
+        key: tuple[Any, ...] = (cell.kind, cell.job)
+        if cell.kind != "result":
+            told = repr((record.get("assets") or {}).get(cell.kind))
+            key = (cell.kind, repr(getattr(config, cell.kind)), told)
         if key not in drawn:
-            drawn[key] = _picture(cell.kind, config, jobs[cell.job].folder, size)
+            drawn[key] = _picture(cell.kind, config, jobs[cell.job], record, size)
         return drawn[key]
 
     lines = [
@@ -140,15 +144,24 @@ def write_figure(jobs: Sequence[Job], folder: RunFolder) -> None:
     folder.write("figure.png", lambda path: _sheet(lines, size).save(path))
 
 
-def _config(job: Job) -> Config:
-    """A job's configuration, from its record or, where it never began, from its overrides."""
-    from styleexp import compose
+def _record(job: Job) -> dict[str, Any]:
+    """A job's record; empty where there is none of its own."""
+    from styleexp import identity
 
     try:
         record = json.loads((job.folder / "run.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return compose.compose([*job.overrides, "hydra.mode=RUN"])
-    return compose.recorded(record["config"])
+        return {} if identity.not_of(job.key, job.overrides, record) else dict(record)
+    except (OSError, ValueError, AttributeError, TypeError):
+        return {}
+
+
+def _config(job: Job, record: dict[str, Any]) -> Config:
+    """A job's configuration, from its record or, where it never began, from its overrides."""
+    from styleexp import compose
+
+    if "config" in record:
+        return compose.recorded(record["config"])
+    return compose.compose([*job.overrides, "hydra.mode=RUN"])
 
 
 def _name(part: Any) -> str:
@@ -156,24 +169,30 @@ def _name(part: Any) -> str:
     return name if getattr(part, "scale", 1.0) == 1.0 else f"{name}, scale {part.scale:g}"
 
 
-def _picture(kind: str, config: Config, folder: Path, size: int) -> Image.Image | str:
+def _picture(
+    kind: str, config: Config, job: Job, record: dict[str, Any], size: int
+) -> Image.Image | str:
     """A picture no larger than ``size``, or words where there is none."""
+    import copy
+
     import numpy as np
     from PIL import Image
 
-    from styleexp import meshes, sources
+    from styleexp import meshes, origins, sources
     from styleexp.errors import UserError
 
     try:
-        if kind == "source":
-            content: Any = sources.load_source(config.source)
-        elif kind == "style":
-            content = sources.load_style(config.style)
+        if kind != "result":
+            part = copy.copy(getattr(config, kind))
+            if record.get("assets"):
+                part.path = str(origins.find(record, config, kind, job.folder) or "") or part.path
+            load: Any = sources.load_source if kind == "source" else sources.load_style
+            content: Any = load(part)
         else:
-            status = runs.read(folder)["status"]
+            status = runs.of_job(job)["status"]
             if status != "done":
-                return str(status)
-            content = meshes.load_mesh(folder / "result.ply")
+                return "another run" if status == "other" else str(status)
+            content = meshes.load_mesh(job.folder / "result.ply")
     except UserError as error:
         return "not found" if kind != "result" else str(error).split(":")[0]
     if isinstance(content, meshes.Mesh):

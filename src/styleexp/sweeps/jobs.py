@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
+
+from styleexp import identity
 
 GROUPS = ("source", "style", "pair")
 """Keys that choose what is stylised; all others are settings."""
+
+
+JOBS = "jobs.json"
+"""What was planned: so a job that never began is seen as missing."""
 
 
 @dataclass(frozen=True)
@@ -18,6 +26,64 @@ class Job:
     """Unique in the sweep; its number where Hydra counts."""
     overrides: tuple[str, ...]
     folder: Path
+    key: str | None = None
+    """Of the run that it asks for (`styleexp.identity`); earlier versions noted none."""
+
+
+def listed(folder: Path) -> dict[str, Any] | None:
+    """A sweep's ``jobs.json``: its ``jobs`` as lists of overrides and their ``keys``, which earlier
+    versions didn't note, or the ``search`` that finds them. None where there is none to be read."""
+    try:
+        content = json.loads((folder / JOBS).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    jobs = content.get("jobs", []) if isinstance(content, dict) else None
+    if not isinstance(jobs, list) or not all(isinstance(each, list) for each in jobs):
+        return None  # another program's file of that name
+    return content
+
+
+def planned(folder: Path) -> list[Job]:
+    """The jobs of Hydra's sweep in ``folder``, in order, with or without a folder of their own.
+
+    Where they weren't known beforehand (as with Optuna), those that were begun.
+    """
+    content = listed(folder)
+    if content is None or "jobs" not in content:
+        numbered = (p for p in folder.glob("*") if p.name.isdigit())
+        return [_begun(p) for p in sorted(numbered, key=lambda p: int(p.name))]
+    keys = content.get("keys") or [None] * len(content["jobs"])
+    return _placed(
+        [
+            Job(str(n), tuple(each), folder / str(n), key)
+            for n, (each, key) in enumerate(zip(content["jobs"], keys, strict=True))
+        ],
+        folder,
+    )
+
+
+def _begun(folder: Path) -> Job:
+    """The job of a search that a folder's own record tells of."""
+    try:
+        record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+        return Job(folder.name, tuple(record["overrides"]), folder, identity.of(record))
+    except (OSError, ValueError, KeyError, TypeError):
+        return Job(folder.name, (), folder)
+
+
+def _placed(jobs: list[Job], folder: Path) -> list[Job]:
+    """The jobs with the folders that hold their runs: ``hydra.sweep.subdir`` may name them in
+    another way than by number."""
+    if all((job.folder / "run.json").exists() for job in jobs):
+        return jobs
+    found = {_begun(path.parent).key: path.parent for path in folder.rglob("run.json")}
+    found.pop(None, None)
+    return [
+        job
+        if (job.folder / "run.json").exists()
+        else replace(job, folder=found.get(job.key, job.folder))
+        for job in jobs
+    ]
 
 
 def product(params: Mapping[str, str] | None, overrides: Sequence[str]) -> list[list[str]]:

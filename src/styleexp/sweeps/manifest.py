@@ -33,10 +33,10 @@ def write(folder: Path, jobs: Iterable[Planned]) -> None:
         before = read(folder)
         listed = {}
         for job in jobs:
-            found = runs.read(job.folder)
-            if found["status"] == "newer":
-                raise UserError(f"cannot run in '{job.folder}': {found['reason']}")
+            found = runs.of_job(job)
+            refuse_others(job, found)
             known = before.pop(job.name, {})
+            known = known if known.get("key") == job.key else {}
             listed[job.name] = {
                 "key": job.key,
                 "experiment": job.entry,
@@ -47,6 +47,17 @@ def write(folder: Path, jobs: Iterable[Planned]) -> None:
         for name, known in before.items():
             listed.setdefault(name, {**known, "state": "outdated"})
         _write(folder, listed)
+
+
+def refuse_others(job: Planned, found: dict[str, Any]) -> None:
+    """Raise `UserError` where a job's folder holds another run, or a later version's."""
+    if found["status"] == "newer":
+        raise UserError(f"cannot run in '{job.folder}': {found['reason']}")
+    if found["status"] == "other":
+        raise UserError(
+            f"'{job.folder}' is not this plan's, {found['reason']}: move it away, or choose "
+            "another --folder."
+        )
 
 
 def read(folder: Path) -> dict[str, dict[str, Any]]:
@@ -76,5 +87,15 @@ def update(folder: Path, name: str, state: str) -> dict[str, dict[str, Any]]:
         return jobs
 
 
+def home(folder: Path) -> Path | None:
+    """The working folder in which a plan was begun, that its relative paths start from."""
+    try:
+        return Path(json.loads((folder / NAME).read_text(encoding="utf-8"))["begun_in"])
+    except (OSError, ValueError, KeyError, TypeError):  # or an earlier version's
+        return None
+
+
 def _write(folder: Path, jobs: dict[str, dict[str, Any]]) -> None:
-    records.RunFolder(folder).write_json(NAME, {"schema": SCHEMA, "jobs": jobs})
+    begun_in = str(home(folder) or Path.cwd())
+    content = {"schema": SCHEMA, "begun_in": begun_in, "jobs": jobs}
+    records.RunFolder(folder).write_json(NAME, content)

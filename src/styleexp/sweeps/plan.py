@@ -18,24 +18,18 @@ A plan is a YAML file (``sweeps/*.yaml``)::
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
 import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import field as option
-from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from styleexp.errors import UserError, unknown_name
+from styleexp.identity import job_key
 from styleexp.overrides import literal, quote, understood
-from styleexp.records import essence
 from styleexp.sweeps.jobs import Job, product, varying
-
-if TYPE_CHECKING:
-    from styleexp.config import Config
 
 
 @dataclass
@@ -71,9 +65,7 @@ class Plan:
 class Planned(Job):
     """A job of a plan. ``name`` is its folder below the plan's."""
 
-    key: str
-    """Hash of its resolved configuration and of the files of its source and style."""
-    entry: str
+    entry: str = ""
 
     def command(self) -> str:
         """The command that does the same."""
@@ -193,29 +185,6 @@ def _parts(plan: Plan, entry: Entry, overrides: Sequence[str]) -> Iterator[list[
         if seeds and (entry.seeds is not None or "optim.seed" not in params):
             given.append(f"optim.seed={','.join(map(str, seeds))}")
         yield product(params, given)
-
-
-def job_key(config: Config) -> str:
-    """Hash of what a run's result follows from: its resolved configuration, this version, and the
-    content of the files of its source and style."""
-    from styleexp import __version__, sources
-
-    files = {}
-    for kind, part in (("source", config.source), ("style", config.style)):
-        try:
-            path = sources.locate(kind, part.name, part.path)
-            files[kind] = _sha256(path) if path else None
-        except UserError:  # the run will say so
-            files[kind] = "not found"
-    content = {"config": essence(dataclasses.asdict(config)), "files": files, "by": __version__}
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-@cache
-def _sha256(path: Path) -> str:
-    from styleexp import assets
-
-    return assets.sha256(path) if path.is_file() else "not found"
 
 
 def _readable(overrides: Mapping[str, str]) -> str:

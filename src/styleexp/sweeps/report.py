@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import csv
-import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from hydra.experimental.callback import Callback
 
-from styleexp import locks
+from styleexp.errors import UserError
 from styleexp.records import RunFolder
 from styleexp.reports import runs
-from styleexp.sweeps.jobs import Job, product, readable, varying
+from styleexp.sweeps import claim
+from styleexp.sweeps.jobs import Job, planned, readable, varying
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-JOBS = "jobs.json"
-"""What was planned: so a job that never began is seen as missing."""
-
+T = TypeVar("T")
 begun: Path | None = None
 """The folder of the sweep that this process began, if it did."""
 
@@ -30,54 +28,34 @@ class OnSweep(Callback):
     """Hydra's callback: note the jobs at the start of a sweep, report at its end."""
 
     def on_run_start(self, config: DictConfig, **rest: Any) -> None:
-        """Keep Hydra from writing its files into the folder of a run that is at work."""
-        from styleexp.cli.run import busy
-
-        folder = Path(config.hydra.run.dir)
-        if locks.held(folder):  # Hydra swallows all exceptions of callbacks but this
-            print(f"styleexp: {busy(folder)}", file=sys.stderr)
-            sys.exit(2)
+        """Claim the run's folder before Hydra writes into it."""
+        _claimed(claim.run, config)
 
     def on_multirun_start(self, config: DictConfig, **rest: Any) -> None:
-        """Write ``jobs.json`` for sweeps whose jobs are known beforehand."""
+        """Claim the sweep's folder and note its jobs, as far as they are known beforehand."""
         global begun
-        folder = Path(config.hydra.sweep.dir)
-        sweeper = config.hydra.sweeper
-        if "BasicSweeper" in sweeper._target_:
-            jobs = product(sweeper.params, list(config.hydra.overrides.task))
-            folder.mkdir(parents=True, exist_ok=True)
-            RunFolder(folder).write_json(JOBS, {"jobs": jobs})
-        begun = folder
+        begun = _claimed(claim.sweep, config)
 
     def on_multirun_end(self, config: DictConfig, **rest: Any) -> None:
         """Write and show what came out."""
         finish(Path(config.hydra.sweep.dir))
 
 
-def planned(folder: Path) -> list[Job]:
-    """The jobs of Hydra's sweep in ``folder``, in order, with or without a folder of their own.
-
-    Where they weren't known beforehand (as with Optuna), those that were begun.
-    """
-    path = folder / JOBS
-    if path.exists():
-        listed = json.loads(path.read_text(encoding="utf-8"))["jobs"]
-        return [Job(str(n), tuple(each), folder / str(n)) for n, each in enumerate(listed)]
-    numbered = sorted((p for p in folder.glob("*") if p.name.isdigit()), key=lambda p: int(p.name))
-    return [Job(p.name, tuple(_overrides(p)), p) for p in numbered]
-
-
-def _overrides(folder: Path) -> list[str]:
+def _claimed(claim_: Callable[[DictConfig], T], config: DictConfig) -> T | None:
+    """What claiming returns. Hydra swallows all exceptions of callbacks but that which ends the
+    process; where a folder can't be made, it says so itself."""
     try:
-        record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-        return list(record["overrides"])
-    except (OSError, ValueError, KeyError):
-        return []
+        return claim_(config)
+    except UserError as error:
+        print(f"styleexp: {error}", file=sys.stderr)
+        sys.exit(2)
+    except OSError:
+        return None
 
 
 def exit_code(folder: Path) -> int:
     """0 if every job of the sweep is done, else 2; by the jobs' own status, whoever ran them."""
-    states = {runs.read(job.folder)["status"] for job in planned(folder)}
+    states = {runs.of_job(job)["status"] for job in planned(folder)}
     return 0 if states == {"done"} else 2
 
 
@@ -113,7 +91,7 @@ def table(jobs: Sequence[Job]) -> list[dict[str, Any]]:
     with ``=``), ``status``, ``seconds``, ``loss``, every metric by its name, and ``reason``."""
     rows = []
     for job, overrides in zip(jobs, varying([job.overrides for job in jobs]), strict=True):
-        run = runs.read(job.folder)
+        run = runs.of_job(job)
         row: dict[str, Any] = {"job": job.name}
         row |= {f"={key}": value for key, value in overrides.items()}
         row |= {key: run[key] for key in ("status", "seconds", "loss")}

@@ -21,8 +21,10 @@ from typing import TYPE_CHECKING, Any
 
 from styleexp import locks, records
 from styleexp.errors import UserError
+from styleexp.overrides import quote
 from styleexp.reports import runs
 from styleexp.sweeps import launchers, manifest
+from styleexp.sweeps.jobs import Job
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -50,8 +52,11 @@ def run(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> None:
     while True:
         if not (folder / manifest.NAME).exists():  # the folder was removed under us
             manifest.write(folder, jobs)
-        states = {job.name: runs.read(job.folder)["status"] for job in jobs}
+        states = {}
         for job in jobs:
+            found = runs.of_job(job)
+            manifest.refuse_others(job, found)
+            states[job.name] = found["status"]
             if states[job.name] not in manifest.ENDED and deaths[job.name] >= MOST_DEATHS:
                 _give_up(job, folder)
                 states[job.name] = "failed"
@@ -65,7 +70,7 @@ def run(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> None:
         batch = [job for job in waiting if job.name not in suspects] or waiting[:1]
         before = _progress(folder, batch)
         error = _launch(batch, folder, launcher)
-        after = {job.name: runs.read(job.folder)["status"] for job in batch}
+        after = {job.name: runs.of_job(job)["status"] for job in batch}
         died = [name for name, state in after.items() if state == "died"]
         if error is not None and not set(after.values()) & set(manifest.ENDED):
             # Nothing came of it: some job can't even leave a status, as in a folder without space.
@@ -86,7 +91,7 @@ def run(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> None:
 def retry(jobs: Sequence[Planned]) -> None:
     """Let failed jobs run again, from their checkpoints where they have one."""
     for job in jobs:
-        if runs.status(job.folder) != "failed":
+        if runs.of_job(job)["status"] != "failed":
             continue
         with suppress(locks.Busy), locks.hold(job.folder):
             again = "failed, to be tried again"
@@ -114,8 +119,6 @@ def _launch(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> E
     from hydra.core.plugins import Plugins
     from hydra.core.utils import JobStatus
     from hydra.types import HydraContext, RunMode
-
-    from styleexp.overrides import quote
 
     with hydra.initialize_config_module("styleexp.conf", version_base="1.3"):
         composed: Any = GlobalHydra.instance().hydra
@@ -154,7 +157,7 @@ def _launch(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> E
 
 def _settle(jobs: Sequence[Planned]) -> None:
     """Wait for the jobs that go on although another of them was killed."""
-    while any(runs.read(job.folder)["status"] == "running" for job in jobs):
+    while any(runs.of_job(job)["status"] == "running" for job in jobs):
         time.sleep(POLL)
 
 
@@ -163,6 +166,8 @@ def task(config: DictConfig) -> None:
 
     Skips what another runner does or did in the meantime. Never raises for the job's own failure.
     """
+    from contextlib import chdir
+
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import OmegaConf
 
@@ -176,9 +181,13 @@ def task(config: DictConfig) -> None:
     given: Any = OmegaConf.to_container(runtime.overrides.task, resolve=False)
     compose.register()
     try:
-        with AT_WORK, locks.hold(folder):
-            if runs.status(folder) not in manifest.ENDED:
-                _work(config, root, folder, name, given)
+        with AT_WORK, locks.hold(folder), chdir(runtime.runtime.cwd):  # see hydra.job.chdir
+            # No key: somebody removed the manifest, which the runner then writes anew.
+            key = manifest.read(root).get(name, {}).get("key")
+            job = Job(name, tuple(given), folder, key)
+            state = runs.of_job(job)["status"] if key else runs.status(folder)
+            if state not in (*manifest.ENDED, "other"):  # the runner refuses another run's folder
+                _work(config, root, job)
     except locks.Busy:
         return
 
@@ -199,11 +208,12 @@ def _end_with_runner() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _work(config: DictConfig, root: Path, folder: Path, name: str, overrides: list[str]) -> None:
+def _work(config: DictConfig, root: Path, job: Job) -> None:
     """Do a job whose lock is held; what it prints goes into its log."""
-    from styleexp import compose
+    from styleexp import compose, identity
     from styleexp.cli.run import begin
 
+    name, folder = job.name, job.folder
     begun = time.perf_counter()
     manifest.update(root, name, "running")
     code = 0
@@ -213,8 +223,14 @@ def _work(config: DictConfig, root: Path, folder: Path, name: str, overrides: li
         redirect_stderr(log),
     ):
         try:
-            told = [each for each in overrides if not each.startswith("launcher=")]
-            code = begin(compose.typed(config), folder, [*told, "hydra.mode=RUN"])
+            told = [each for each in job.overrides if not each.startswith("launcher=")]
+            typed = compose.typed(config)
+            if job.key not in (None, identity.job_key(typed)):
+                raise UserError(
+                    "a file of its source or style has changed since the plan was read: start the "
+                    "plan again."
+                )
+            code = begin(typed, folder, [*told, "hydra.mode=RUN"])
         except UserError as error:
             _failed(folder, str(error))
             print(f"styleexp: {error}")

@@ -1,0 +1,140 @@
+"""The files that a run was made from: where they lay, and whether they are still the same.
+
+Whatever comes back to a run (``resume=``, metrics, maps, pages, figures) reads them through here,
+from any working folder: a file is the run's if its content is the recorded one, not if its name is.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from styleexp import assets, identity, sources
+from styleexp.errors import UserError
+
+if TYPE_CHECKING:
+    from styleexp.config import Config
+
+
+def describe(config: Config) -> dict[str, dict[str, str | None]]:
+    """Name, absolute path and sha256 of the source and style, for the run's record; analytic shapes
+    have no file, their definition is this version's. Raises `UserError` for what isn't there."""
+    found = {}
+    for kind in identity.FILES:
+        part = getattr(config, kind)
+        path = sources.locate(kind, part.name, part.path)
+        digest = identity.sha256(path) if path else None
+        if digest == identity.ABSENT:
+            raise UserError(f"the {kind} '{path}' does not exist.")
+        found[kind] = {
+            "name": part.name,
+            "path": str(path.absolute()) if path else None,
+            "sha256": digest,
+        }
+    return found
+
+
+def noted(config: Config) -> dict[str, Any]:
+    """``assets``, see `describe`, and the ``weights`` of encoder and judge, as far as they are
+    there: for the record of a run that is about to begin."""
+    from styleexp import metrics
+
+    record: dict[str, Any] = {"weights": {}}
+    with suppress(UserError, OSError):  # the run itself will say so
+        record["assets"] = describe(config)
+    names = {config.encoder.name}
+    with suppress(UserError):
+        names.add(metrics.judge_name(config.metrics.judge, config.encoder.name) or "")
+    for name in sorted(names & set(assets.names("weights"))):
+        # Their content is checked against what was published whenever they are read.
+        if path := assets.locate(name, "weights"):
+            record["weights"][name] = {
+                "path": str(path.absolute()),
+                "sha256": identity.sha256(path),
+            }
+    return record
+
+
+def restored(
+    record: Mapping[str, Any],
+    folder: Path,
+    purpose: str,
+    tell: Callable[[str], Any] | None = None,
+) -> Config:
+    """The configuration of a run's record, with the very files that the run was made from.
+
+    ``tell`` takes notes for the user; by default they are printed to standard error. Raises
+    `UserError` for a file that has changed or is gone, and what `compose.recorded` raises.
+    """
+    from styleexp import compose
+
+    config = compose.recorded(record.get("config"))
+    for kind in identity.FILES:
+        try:
+            path = find(record, config, kind, folder, tell)
+        except UserError as error:
+            raise UserError(f"cannot {purpose} '{folder}': {error}") from None
+        if path is not None:
+            getattr(config, kind).path = str(path)
+    return config
+
+
+def find(
+    record: Mapping[str, Any],
+    config: Config,
+    kind: str,
+    folder: Path,
+    tell: Callable[[str], Any] | None = None,
+) -> Path | None:
+    """The file that the run in ``folder`` had for its source or style; None where it had none.
+
+    Raises `UserError`, with the end of a sentence, for a file that has changed or is gone.
+    """
+    part = getattr(config, kind)
+    told = (record.get("assets") or {}).get(kind) or {}
+    digest = told.get("sha256")
+    if digest is None:
+        path = sources.locate(kind, part.name, part.path)
+        if path is None:
+            return None
+        raise UserError(f"its record has no sha256 of its {kind} '{path}': start the run anew.")
+    named = Path(str(told.get("path") or part.path or part.name))
+    there = False
+    for path in _candidates(named, kind, part, folder):
+        if not path.is_file():
+            continue
+        if identity.sha256(path) == digest:
+            if path != named:
+                (tell or _tell)(
+                    f"note: the {kind} of '{folder}' was '{named}'; '{path}' is the same file, by "
+                    "its sha256, and is used."
+                )
+            return path
+        there = there or path == named or not named.is_absolute()
+    where = "" if named.is_absolute() else f" (looked for in '{Path.cwd()}')"
+    what = "has changed since the run began" if there else "is gone"
+    raise UserError(
+        f"its {kind} '{named}' {what}{where}: put it back as it was, or start the run anew."
+    )
+
+
+def _candidates(named: Path, kind: str, part: Any, folder: Path) -> Iterator[Path]:
+    """Where a run's file may lie: where it lay, or, for records without absolute paths and folders
+    that were moved together, as far from the run's folder or this one; or where its name leads."""
+    if named.is_absolute():
+        yield named
+    typed = Path(part.path) if part.path else named
+    if not typed.is_absolute():
+        for base in (Path.cwd(), *folder.absolute().parents):
+            yield base / typed
+    if not part.path:
+        with suppress(UserError):
+            if path := sources.locate(kind, part.name, None):
+                yield path.absolute()
+
+
+def _tell(note: str) -> None:
+    print(note, file=sys.stderr)

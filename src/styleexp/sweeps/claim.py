@@ -1,0 +1,163 @@
+"""A run's or a sweep's folder is its own, from before Hydra writes the first file into it.
+
+A folder that is named by the time gets another name where that one is taken: two commands of one
+second would share it. A folder that the user named is refused while another process is at it, and
+a sweep's also where it holds the results of other jobs.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from styleexp import locks
+from styleexp.errors import UserError
+from styleexp.overrides import quote
+from styleexp.records import RunFolder
+from styleexp.reports import runs
+from styleexp.sweeps.jobs import JOBS, Job, listed, product
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+PATIENCE = 2.0
+"""Seconds to wait for a folder: who only looks whether it is held, holds it for a moment."""
+
+
+def run(config: DictConfig) -> None:
+    """Claim the folder of a single run; ``config`` then names it.
+
+    Raises `UserError` where another process is at work in a folder that the user named.
+    """
+    _claim(config, "run")
+
+
+def sweep(config: DictConfig) -> Path:
+    """The same for a sweep, whose jobs are noted in ``jobs.json``; returns its folder.
+
+    Raises `UserError` also where the folder holds results of other jobs.
+    """
+    folder = _claim(config, "sweep")
+    try:
+        jobs = _jobs(config, folder)
+        content: dict[str, Any] = {"search": _search(config)}
+        if jobs is not None:
+            content = {"jobs": [job.overrides for job in jobs], "keys": [job.key for job in jobs]}
+        _refuse_others(folder, jobs or (), content)
+    except BaseException:
+        locks.drop(folder)
+        raise
+    RunFolder(folder).write_json(JOBS, content)
+    return folder
+
+
+def _claim(config: DictConfig, kind: str) -> Path:
+    """Lock the folder ``hydra.KIND.dir``, or one beside it where that is taken and any name
+    will do."""
+    from omegaconf import OmegaConf, open_dict, read_write
+
+    named = f"hydra.{kind}.dir"
+    folder = Path(OmegaConf.select(config, named))
+    raw = OmegaConf.to_container(config.hydra[kind], resolve=False)
+    assert isinstance(raw, dict)
+    given = any(each.lstrip("+").startswith(f"{named}=") for each in config.hydra.overrides.hydra)
+    if given or "${now:" not in str(raw["dir"]):
+        try:
+            locks.take(folder, PATIENCE)
+        except locks.Busy:
+            raise UserError(busy(folder, kind)) from None
+        return folder
+    fresh = _fresh(folder)
+    if fresh != folder:
+        with read_write(config.hydra), open_dict(config.hydra):
+            config.hydra[kind].dir = str(fresh)
+            # A sweep's jobs are composed anew, with these.
+            config.hydra.overrides.hydra.append(f"{named}={quote(str(fresh))}")
+    return fresh
+
+
+def busy(folder: Path, kind: str = "run") -> str:
+    """What is said of a folder that another process holds."""
+    return (
+        f"another process is at work in '{folder}': wait for it, or choose another folder with "
+        f"hydra.{kind}.dir=FOLDER."
+    )
+
+
+def _fresh(folder: Path) -> Path:
+    """Make and lock a folder that nobody has: this one, or the first free one of its name with a
+    number."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    for each in _names(folder):
+        with suppress(FileExistsError, locks.Busy):
+            each.mkdir()
+            locks.take(each)
+            return each
+    raise AssertionError("there is always another number")
+
+
+def _names(folder: Path) -> Iterator[Path]:
+    yield folder
+    for number in itertools.count(2):
+        yield folder.with_name(f"{folder.name}_{number}")
+
+
+def _jobs(config: DictConfig, folder: Path) -> list[Job] | None:
+    """The sweep's jobs with their keys; None where the sweeper finds them as it goes."""
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.hydra_config import HydraConfig
+    from omegaconf import open_dict
+
+    from styleexp import compose, identity
+
+    if "BasicSweeper" not in config.hydra.sweeper._target_:
+        return None
+    listed = product(config.hydra.sweeper.params, list(config.hydra.overrides.task))
+    loader: Any = GlobalHydra.instance().config_loader()
+    jobs, before = [], HydraConfig.instance().cfg
+    for number, overrides in enumerate(listed):
+        key = None
+        # What can't be composed ends the sweep, or fails the job: Hydra or the job will say so.
+        with suppress(Exception):
+            composed = loader.load_sweep_config(config, list(overrides))
+            with open_dict(composed):
+                composed.hydra.job.id = composed.hydra.job.num = number
+                HydraConfig.instance().set_config(composed)
+                del composed["hydra"]
+            key = identity.job_key(compose.typed(composed))
+        jobs.append(Job(str(number), tuple(overrides), folder / str(number), key))
+    HydraConfig.instance().cfg = before
+    return jobs
+
+
+def _search(config: DictConfig) -> dict[str, Any]:
+    """What a search asks for, as its jobs aren't known beforehand."""
+    from omegaconf import OmegaConf
+
+    return {
+        "overrides": list(config.hydra.overrides.task),
+        "sweeper": json.loads(
+            json.dumps(OmegaConf.to_container(config.hydra.sweeper, resolve=True), default=str)
+        ),
+    }
+
+
+def _refuse_others(folder: Path, jobs: Sequence[Job], content: dict[str, Any]) -> None:
+    """Raise `UserError` where a folder holds results of jobs that aren't these. What failed for
+    another reason than these jobs have may be tried again."""
+    told = "choose another folder with hydra.sweep.dir=FOLDER, or remove it."
+    before = listed(folder)
+    if before is not None:
+        asked = "jobs" if "jobs" in content else "search"
+        if before.get(asked) != json.loads(json.dumps(content[asked])):
+            raise UserError(f"'{folder}' holds another sweep: {told}")
+    for job in jobs:
+        found = runs.of_job(job)
+        if found["status"] == "newer":
+            raise UserError(f"cannot run in '{job.folder}': {found['reason']}")
+        if found["status"] == "other" and runs.status(job.folder) != "failed":
+            raise UserError(f"'{job.folder}' is not this sweep's, {found['reason']}: {told}")
