@@ -1241,7 +1241,13 @@ def _gltf() -> None:
         WORKS,
     )
     skin = {"skins": [{"joints": [0]}]}
-    build("skin", "a skin", lambda d: (d.update(skin), d["nodes"][0].update(skin=0)), WORKS)
+    build(
+        "skin",
+        "a node with a skin, whose mesh has no joints",
+        lambda d: (d.update(skin), d["nodes"][0].update(skin=0)),
+        REPAIRED,
+        "kept skins",
+    )
     build(
         "animation",
         "an animation",
@@ -1253,9 +1259,16 @@ def _gltf() -> None:
                 }
             ]
         ),
-        WORKS,
+        REPAIRED,
+        "kept animations",
     )
-    build("morph", "a morph target", primitive(targets=[{"POSITION": 0}]), WORKS)
+    build(
+        "morph",
+        "a morph target",
+        primitive(targets=[{"POSITION": 0}]),
+        REPAIRED,
+        "kept morph targets",
+    )
     build(
         "camera",
         "a camera and no mesh",
@@ -1382,6 +1395,100 @@ def _gltf() -> None:
         kind="gltf",
         beside={"../secret/skin.png": picture("PNG")},
     )
+
+
+def _gltf_numbers() -> None:
+    group = "numbers of glTF"
+
+    def build(name, what, columns=(), change=None, outcome=WORKS, says="", **more):
+        """``columns``: attribute, numbers, component type, normalised."""
+        document, buffer = gltf_parts()
+        for attribute, values, kind, normalised in columns:
+            buffer += bytes(-len(buffer) % 4)
+            content = np.ascontiguousarray(values)
+            document["bufferViews"].append(
+                {"buffer": 0, "byteOffset": len(buffer), "byteLength": content.nbytes}
+            )
+            buffer += content.tobytes()
+            accessor = {
+                "bufferView": len(document["bufferViews"]) - 1,
+                "componentType": kind,
+                "count": len(content),
+                "type": {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}[content.shape[1]],
+            }
+            document["accessors"].append(accessor | ({"normalized": True} if normalised else {}))
+            primitive = document["meshes"][0]["primitives"][0]
+            primitive["attributes"][attribute] = len(document["accessors"]) - 1
+        document["buffers"][0]["byteLength"] = len(buffer)
+        if change is not None:
+            change(document)
+        known = BALL if outcome != REFUSED else {}
+        content = glb(document, buffer)
+        case(group, f"{name}.glb", what, content, outcome, says, **{**known, **more})
+
+    share = (V[:, :2] + 1) / 2
+    build("uvfloat", "texture coordinates without a material",
+          [("TEXCOORD_0", share.astype("<f4"), 5126, False)])  # fmt: skip
+    padded = np.pad((share * 255).astype("u1"), ((0, 0), (0, 2)))
+    build("uvbyte", "texture coordinates of 8 bits, in strides",
+          [("TEXCOORD_0", padded, 5121, True)],
+          lambda d: (d["accessors"][2].update(type="VEC2"),
+                     d["bufferViews"][2].update(byteStride=4)))  # fmt: skip
+    build("uvshort", "texture coordinates of 16 bits",
+          [("TEXCOORD_0", (share * 65535).astype("<u2"), 5123, True)])  # fmt: skip
+    color = ((V + 1) / 2 * 65535).astype("<u2")
+    opaque = np.pad(color, ((0, 0), (0, 1)), constant_values=65535)
+    build("color16", "colours of 16 bits", [("COLOR_0", opaque, 5123, True)])
+    build("colorfloat", "colours of floats, without opacity",
+          [("COLOR_0", (color / 65535).astype("<f4"), 5126, False)])  # fmt: skip
+    build("second", "a second set of texture coordinates, tangents",
+          [("TEXCOORD_0", share.astype("<f4"), 5126, False),
+           ("TEXCOORD_1", share[::-1].astype("<f4"), 5126, False),
+           ("NORMAL", V.astype("<f4"), 5126, False),
+           ("TANGENT", np.pad(V[:, [1, 2, 0]], ((0, 0), (0, 1)), constant_values=1).astype("<f4"),
+            5126, False)])  # fmt: skip
+    short = np.pad(np.round(V * 32767).astype("<i2"), ((0, 0), (0, 1)))
+
+    def quantised(document: dict) -> None:
+        document["accessors"][2]["type"] = "VEC3"
+        document["bufferViews"][2]["byteStride"] = 8
+        document["extensionsRequired"] = document["extensionsUsed"] = ["KHR_mesh_quantization"]
+
+    build("quantised", "positions of 16 bits (KHR_mesh_quantization)",
+          [("POSITION", short, 5122, True)], quantised)  # fmt: skip
+
+    def sparse(document: dict) -> None:
+        # The second column's view holds the indices, the third's the values.
+        document["accessors"][0]["sparse"] = {
+            "count": 3,
+            "indices": {"bufferView": 2, "componentType": 5121},
+            "values": {"bufferView": 3},
+        }
+        attributes = document["meshes"][0]["primitives"][0]["attributes"]
+        del attributes["_INDICES"], attributes["_VALUES"]
+
+    parts = [("_INDICES", np.array([[1], [5], [7]], "u1"), 5121, False),
+             ("_VALUES", (V[[1, 5, 7]] * 1.1).astype("<f4"), 5126, False)]  # fmt: skip
+    build("sparse", "sparse positions", parts, sparse)
+    build("sparsebeyond", "a sparse position beyond the last",
+          [("_INDICES", np.array([[1], [5], [99]], "u1"), 5121, False), parts[1]], sparse,
+          REFUSED, "element 99 of 42")  # fmt: skip
+    build("fewcolors", "fewer colours than vertices",
+          [("COLOR_0", color[:9], 5123, True)], None, REFUSED, "9 elements")  # fmt: skip
+    build("stride", "a stride shorter than its elements", (),
+          lambda d: d["bufferViews"][0].update(byteStride=4), REFUSED, "than it holds")  # fmt: skip
+    build("instances", "a hundred thousand nodes that show one mesh", (),
+          lambda d: d.update(nodes=[{"mesh": 0}] * 100_000,
+                             scenes=[{"nodes": list(range(100_000))}]),
+          REFUSED, "so often")  # fmt: skip
+    build("diamond", "nodes below two others, 2^60 ways to the mesh", (),
+          lambda d: d.update(nodes=[*({"children": [k + 1, k + 1]} for k in range(60)),
+                                    {"mesh": 0}]),
+          REFUSED, "below two others")  # fmt: skip
+    instancing = {"EXT_mesh_gpu_instancing": {"attributes": {}}}
+    build("instancing", "instances by an extension that isn't required", (),
+          lambda d: d["nodes"][0].update(extensions=instancing),
+          REFUSED, "EXT_mesh_gpu_instancing")  # fmt: skip
 
 
 def _renamed() -> None:
@@ -1536,6 +1643,7 @@ for _group in (
     _text,
     _materials,
     _gltf,
+    _gltf_numbers,
     _renamed,
     _pictures,
 ):

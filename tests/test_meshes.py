@@ -21,6 +21,8 @@ from styleexp.errors import UserError
 from styleexp.meshes.obj import triangulate
 from styleexp.meshes.reading import READABLE
 
+pytestmark = pytest.mark.usefixtures("valid_glbs")
+
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
 # Outward quads over CUBE.
 QUADS = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]

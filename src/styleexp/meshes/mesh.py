@@ -41,8 +41,8 @@ class Carrier:
     """An OBJ file's material library, so that saving as OBJ loses none of its lines."""
     textures: dict[str, bytes] = field(default_factory=dict)
     """The image files by the names that ``mtl`` uses."""
-    scene: Any = None
-    """A glTF file's ``trimesh.Scene``; its geometries' vertices, in order, are the rows."""
+    document: Any = None
+    """A glTF file's `styleexp.meshes.gltf.Document`."""
 
 
 @dataclass(frozen=True)

@@ -12,22 +12,14 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from styleexp import images
 from styleexp.errors import UserError
 from styleexp.meshes import whole
+from styleexp.meshes.gltf import read_gltf
 from styleexp.meshes.mesh import Carrier, Mesh
 from styleexp.meshes.obj import read_obj, surface
 from styleexp.meshes.references import Beside
 from styleexp.meshes.welding import check_indices, plural, weld
 
-TEXTURES = (
-    "baseColorTexture",
-    "emissiveTexture",
-    "metallicRoughnessTexture",
-    "normalTexture",
-    "occlusionTexture",
-)
-"""Where trimesh's ``PBRMaterial`` has pictures."""
 READABLE = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
 
 
@@ -64,7 +56,8 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
     try:
         # Junk may hold numbers that overflow on the way; `weld` speaks about them.
         with np.errstate(all="ignore"):
-            points, carrier, notes = (read_obj if kind == ".obj" else _read)(data, path)
+            read = {".obj": read_obj, ".glb": read_gltf, ".gltf": read_gltf}.get(kind, _read)
+            points, carrier, notes = read(data, path)
         return weld(path.stem, points, carrier, notes)
     except UserError as error:
         raise UserError(f"'{path}' {error}") from None
@@ -88,9 +81,6 @@ def _read(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
     resolver = Beside(path)
     scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
     notes: list[str] = []
-    gltf = kind in ("glb", "gltf")
-    if gltf:
-        _check_textures(scene, whole.gltf_header(kind, data), resolver, notes)
     nodes = _own_geometries(scene)
     if len(nodes) < len(scene.graph.nodes_geometry):
         notes.append("left out what has no faces")
@@ -117,18 +107,14 @@ def _read(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
 
         # The specification: a mirrored node winds the other way.
         faces = shape.faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else shape.faces
-        part = node if gltf or len(nodes) > 1 else path.stem
-        if shape.metadata.get("from_gltf_primitive"):
-            part = scene.graph.transforms.parents[node]
+        part = node if len(nodes) > 1 else path.stem
         number, material = -1, _material(shape.visual)
         if material is not None:
             number, _ = materials.setdefault(hash(material), (len(materials), material))
-        normals = shape.vertex_normals @ np.linalg.pinv(matrix[:3, :3]) if gltf else None
         for column, values in (
             ("points", trimesh.transform_points(shape.vertices, matrix)),
             ("corners", faces + sum(lengths)),
             ("uv", getattr(shape.visual, "uv", None)),
-            ("normals", normals),
             ("colors", _colors(shape.visual)),
             ("part", np.full(len(faces), parts.setdefault(part, len(parts)))),
             ("material", np.full(len(faces), number)),
@@ -144,13 +130,11 @@ def _read(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
         np.zeros(sum(lengths), dtype=np.int64),
         np.zeros(len(corners), dtype=bool),
         uv=_joined(columns["uv"], lengths[1:], np.zeros(2)),
-        normals=_joined(columns["normals"], lengths[1:], np.zeros(3)),
         colors=_joined(columns["colors"], lengths[1:], np.full(4, 255, dtype=np.uint8)),
         parts=tuple(parts),
         face_part=np.concatenate(columns["part"]),
         materials=tuple(material for _, material in materials.values()),
         face_material=np.concatenate(columns["material"]),
-        scene=scene if gltf else None,
     )
     return np.concatenate(columns["points"]), carrier, notes
 
@@ -161,38 +145,6 @@ def _declared_faces(kind: str, data: bytes, shape: trimesh.Trimesh) -> int:
         return shape.metadata["_ply_raw"]["face"]["length"]
     counts = re.search(rb"^(?:OFF)?[ \t]*\d+[ \t]+(\d+)", data, re.MULTILINE)
     return int(counts[1]) if kind == "off" and counts else 0
-
-
-def _check_textures(
-    scene: trimesh.Scene, header: dict[str, Any], resolver: Beside, notes: list[str]
-) -> None:
-    """Take out textures that can't be decoded: trimesh would find out when the result is saved."""
-    absent = 0
-    for image in header.get("images", ()):
-        uri = image.get("uri", "")
-        if uri and "base64," not in uri:
-            try:
-                resolver.get(uri)
-            except UserError as error:
-                absent += 1
-                notes.append(f"saved without a texture: the file {str(error).split(':')[0]}")
-    faults: dict[int, str] = {}
-    for shape in scene.geometry.values():
-        material = getattr(getattr(shape, "visual", None), "material", None)
-        for slot in TEXTURES if material is not None else ():
-            image = getattr(material, slot, None)
-            if image is None:
-                continue
-            if id(image) not in faults:
-                faults[id(image)] = images.fault_of(image)
-                if faults[id(image)]:
-                    notes.append(f"saved without a texture ({slot}): it {faults[id(image)]}")
-            if faults[id(image)]:
-                setattr(material, slot, None)
-    lost = len(header.get("images", ())) - absent - len(faults)
-    if lost > 0:
-        number = plural(lost, "texture", "textures")
-        notes.append(f"saved without {number} that no material uses or that can't be decoded")
 
 
 def _own_geometries(scene: trimesh.Scene) -> list[str]:

@@ -71,7 +71,8 @@ def weld(name: str, points: np.ndarray, carrier: Carrier, notes: list[str]) -> M
     faces = np.where(flipped[:, None], file_faces[:, ::-1], file_faces)
 
     carrier = replace(carrier, rows=rows, flipped=flipped)
-    if carrier.uv is None and carrier.normals is None and carrier.colors is None:
+    columns = (carrier.uv, carrier.normals, carrier.colors, carrier.document)
+    if all(column is None for column in columns):
         carrier = replace(carrier, corners=file_faces, rows=np.arange(len(vertices)))
     return Mesh(name, vertices, np.ascontiguousarray(faces), tuple(notes), carrier)
 

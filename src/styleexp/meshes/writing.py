@@ -12,16 +12,13 @@ import trimesh
 
 from styleexp import atomic
 from styleexp.errors import UserError
+from styleexp.meshes.gltf_writing import DISPLACEMENT, glb_of
 from styleexp.meshes.mesh import Carrier, Mesh, vertex_normals
 from styleexp.meshes.obj import MAP, surface
 from styleexp.meshes.references import bare
 
 if TYPE_CHECKING:
     from jaxtyping import Float
-
-
-DISPLACEMENT = "_DISPLACEMENT"
-"""glTF wants custom attributes to begin with an underscore, and to be in capitals."""
 
 
 def save_mesh(
@@ -39,7 +36,8 @@ def save_mesh(
     - PLY: one object without textures; ``displacement`` is its float vertex property.
     - OBJ: faces and materials in the file's order. Materials and images are written beside it,
       named after it: ``out.obj``, ``out.mtl``, ``out_wood.png``.
-    - GLB: a glTF file's scene as trimesh knows it; otherwise a node for each part. ``displacement``
+    - GLB: a glTF file's own document, with new positions, their normals (where it has some) and
+      without their tangents; otherwise a node for each part. ``displacement``
       is the custom attribute ``_DISPLACEMENT``, in the mesh's own units whatever the nodes' scale.
 
     PLY and GLB hold single precision. Every file is replaced in one step, so an interrupted run
@@ -72,10 +70,17 @@ def save_mesh(
     elif kind == ".obj":
         files = _obj(carrier, vertices, path)
     else:
-        make = _moved_scene if carrier.scene is not None else _new_scene
         values = None if displacement is None else np.asarray(displacement, np.float32)
-        scene = make(carrier, vertices, _row_normals(carrier, vertices), values)
-        files = {path.name: scene.export(file_type="glb", include_normals=True)}
+        normals = _row_normals(carrier, vertices)
+        if carrier.document is not None:
+            rows = carrier.rows
+            moved = (vertices != mesh.vertices).any(axis=1)[rows]
+            values = None if values is None else values[rows]
+            content = glb_of(carrier, vertices[rows], moved, normals, values)
+        else:
+            scene = _new_scene(carrier, vertices, normals, values)
+            content = scene.export(file_type="glb", include_normals=True)
+        files = {path.name: content}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():  # the mesh comes last, when all it needs is there
@@ -131,26 +136,6 @@ def _ply(carrier: Carrier, vertices: np.ndarray, displacement: np.ndarray | None
 
 
 # --------------------------------------------------------------------------------------------- GLB
-
-
-def _moved_scene(
-    carrier: Carrier, vertices: np.ndarray, normals: np.ndarray, displacement: np.ndarray | None
-) -> trimesh.Scene:
-    """The input's scene with new positions and normals, each in its node's frame."""
-    scene = carrier.scene.copy()
-    node_of = {scene.graph[node][1]: node for node in scene.graph.nodes_geometry}
-    start = 0
-    for name, shape in scene.geometry.items():
-        if not len(getattr(shape, "faces", ())):
-            continue
-        matrix, _ = scene.graph[node_of[name]]
-        rows = slice(start, start + len(shape.vertices))
-        start = rows.stop
-        moved = trimesh.transform_points(vertices[carrier.rows[rows]], np.linalg.pinv(matrix))
-        shape.vertices = moved
-        shape.vertex_normals = normals[rows] @ matrix[:3, :3]
-        _attach(shape, displacement, carrier.rows[rows])
-    return scene
 
 
 def _attach(shape: trimesh.Trimesh, displacement: np.ndarray | None, rows: np.ndarray) -> None:

@@ -139,13 +139,15 @@ def read_moved(folder: Path) -> tuple[meshes.Mesh, np.ndarray, np.ndarray]:
     if source is None:
         raise UserError(f"'{folder}' can't be used: {' '.join(missing)}")
     try:
-        stored, _, values = read_result(path)
+        stored, faces, values = read_result(path)
     except Exception as error:  # trimesh raises almost anything on a damaged file
         raise UserError(f"'{path}' cannot be read ({error}): run again.") from None
-    rows = np.arange(len(source.vertices))
+    rows, corners = np.arange(len(source.vertices)), source.faces
     if source.carrier is not None:
-        rows = source.carrier.rows[ply_rows(source.carrier)[0]]
-    if values is None or len(stored) != len(rows):
+        first, combined = ply_rows(source.carrier)
+        rows, corners = source.carrier.rows[first], combined[source.carrier.corners]
+    # As many vertices in another order, as another version wrote them, would be another mesh.
+    if values is None or len(stored) != len(rows) or not np.array_equal(faces, corners):
         raise UserError(
             f"'{path}' has other vertices than its source '{source.name}' (as baseline="
             "geometric_textures makes them, which resamples it), so its displacement is not of "
