@@ -364,13 +364,14 @@ def _counts() -> None:
             )
             number_faces = {"fewer": 60}.get(name, number + 40)
             if name != "fewer":
-                some = name == "minus" and short == "ascii"
+                some = name == "minus"
                 case(
                     group,
                     f"faces-{name}-{short}.ply",
                     f"{number_faces} faces promised, 80 there",
                     ply(kind=kind, face_count=number_faces),
                     REPAIRED if some else REFUSED,
+                    "after its last element" if some else "",
                 )
         whole = off().split(b"\n", 2)
         case(
@@ -694,8 +695,8 @@ def _topology() -> None:
             f"quads.{kind}",
             "quads",
             write(CUBE, QUADS),
-            REPAIRED if kind == "obj" else WORKS,
-            "triangulated" if kind == "obj" else "",
+            REPAIRED,
+            "triangulated",
             **BOX,
         )
     case(
@@ -712,15 +713,17 @@ def _topology() -> None:
         "mixed.ply",
         "triangles and quads, binary",
         ply(CUBE, [*QUADS[:5], *[(1, 5, 7), (1, 7, 3)]]),
-        REFUSED,
-        "with triangles only",
+        REPAIRED,
+        "triangulated 5 quads",
+        **BOX,
     )
     case(
         group,
         "mixed.off",
         "triangles and quads",
         off(CUBE, [*QUADS[:5], *[(1, 5, 7), (1, 7, 3)]]),
-        WORKS,
+        REPAIRED,
+        "triangulated",
         **BOX,
     )
     circle = np.array([(np.cos(a), np.sin(a), 0) for a in np.arange(500) * np.pi / 250])
@@ -758,7 +761,8 @@ def _topology() -> None:
         "lines.obj",
         "lines and points among the faces",
         obj(after="l 1 2 3\np 4\n"),
-        WORKS,
+        REPAIRED,
+        "(l, p)",
         **BALL,
     )
     case(
@@ -1491,6 +1495,57 @@ def _gltf_numbers() -> None:
           REFUSED, "EXT_mesh_gpu_instancing")  # fmt: skip
 
 
+def _tables() -> None:
+    group = "what PLY and OBJ files have besides"
+    head, body = ply(kind="ascii").split(b"end_header\n")
+    rows = body.splitlines()
+
+    def wider(vertex=b"", face=b"", values=b"", face_values=b"", after=b"", element=b"") -> bytes:
+        """The ball with more properties, all rows with the same numbers."""
+        top = head.replace(b"element face", vertex + b"element face") + face + element
+        lines = [row + values for row in rows[:42]] + [row + face_values for row in rows[42:]]
+        return top + b"end_header\n" + b"\n".join(lines) + b"\n" + after
+
+    def one(*names: str, kind="float") -> bytes:
+        return "".join(f"property {kind} {name}\n" for name in names).encode()
+
+    lists = b"property list uchar float weights\n"
+    case(group, "confidence.ply", "vertices' confidence and label",
+         wider(one("confidence") + one("label", kind="int"), values=b" 0.5 7"),
+         REPAIRED, "vertex properties (confidence, label)", **BALL)  # fmt: skip
+    case(group, "segment.ply", "faces' segment", wider(face=one("segment"), face_values=b" 3"),
+         REPAIRED, "GLB none for face properties (segment)", **BALL)  # fmt: skip
+    case(group, "lists.ply", "a list for each vertex", wider(lists, values=b" 2 0.5 0.5"),
+         REPAIRED, "weights", **BALL)  # fmt: skip
+    case(group, "facecolors.ply", "faces' colours",
+         wider(face=one("red", "green", "blue", kind="uchar"), face_values=b" 9 99 199"),
+         REPAIRED, "face colours", **BALL)  # fmt: skip
+    case(group, "normals.ply", "vertices' normals",
+         wider(one("nx", "ny", "nz"), values=b" 0 0 1"), WORKS, **BALL)  # fmt: skip
+    case(group, "uvcolors.ply", "texture coordinates and colours",
+         wider(one("s", "t") + one("red", "green", "blue", kind="uchar"), values=b" .5 .1 9 9 9"),
+         WORKS, **BALL)  # fmt: skip
+    case(group, "edges.ply", "an element of edges",
+         wider(element=b"element edge 1\n" + one("vertex1", "vertex2", kind="int"), after=b"0 1\n"),
+         REPAIRED, "element 'edge'", **BALL)  # fmt: skip
+    strips = ply(faces=[], kind="ascii").replace(b"face 0", b"tristrips 1") + b"4 0 1 2 3\n"
+    case(group, "strips.ply", "triangle strips", strips, REFUSED, "triangle strips")
+    case(group, "type.ply", "a number that its type can't hold",
+         wider(one("label", kind="uchar"), values=b" 300"), REFUSED, "cannot hold")  # fmt: skip
+    lines = obj().split(b"\n")
+
+    def colored(weight: bytes, every: int) -> bytes:
+        color = [line + weight + b" 0.5 0.25 0.125" * (k % every == 0)
+                 for k, line in enumerate(lines[:42])]  # fmt: skip
+        return b"\n".join([*color, *lines[42:]])
+
+    case(group, "colors.obj", "colours after three coordinates", colored(b"", 1), WORKS, **BALL)
+    case(group, "colors4.obj", "colours after four", colored(b" 1.0", 1), WORKS, **BALL)
+    case(group, "somecolors.obj", "colours on some vertices", colored(b"", 3), WORKS, **BALL)
+    groups = obj().replace(b"\nf", b"\no hull\ng left\ns 1\nf", 1)
+    case(group, "groups.obj", "an object, a group and smoothing", groups, WORKS, **BALL)
+
+
 def _renamed() -> None:
     group = "files that are something else"
     others = {"junk": JUNK, "text": TEXT, "page": HTML, "picture": picture("PNG")}
@@ -1644,6 +1699,7 @@ for _group in (
     _materials,
     _gltf,
     _gltf_numbers,
+    _tables,
     _renamed,
     _pictures,
 ):

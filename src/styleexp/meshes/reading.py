@@ -16,17 +16,19 @@ from styleexp.errors import UserError
 from styleexp.meshes import whole
 from styleexp.meshes.gltf import read_gltf
 from styleexp.meshes.mesh import Carrier, Mesh
-from styleexp.meshes.obj import read_obj, surface
+from styleexp.meshes.obj import read_obj
+from styleexp.meshes.ply_meshes import read_ply
 from styleexp.meshes.references import Beside
 from styleexp.meshes.welding import check_indices, plural, weld
 
+READERS = {".obj": read_obj, ".ply": read_ply, ".glb": read_gltf, ".gltf": read_gltf}
 READABLE = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
 
 
 def load_mesh(path: str | os.PathLike[str]) -> Mesh:
     """Load an OBJ, PLY, STL, OFF, GLB or glTF file as one welded triangle mesh.
 
-    Faces keep the file's order, quads and n-gons triangulated in place (but a PLY or OFF file that
+    Faces keep the file's order, quads and n-gons triangulated in place (but an OFF file that
     mixes them gives its triangles first). Vertices at one position become one; vertices that no
     face uses are left out. All geometries of a glTF scene are joined in world space. Parts whose
     faces point inwards, or disagree among themselves, are turned for the optimisation and saved
@@ -56,7 +58,7 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
     try:
         # Junk may hold numbers that overflow on the way; `weld` speaks about them.
         with np.errstate(all="ignore"):
-            read = {".obj": read_obj, ".glb": read_gltf, ".gltf": read_gltf}.get(kind, _read)
+            read = READERS.get(kind, _read)
             points, carrier, notes = read(data, path)
         return weld(path.stem, points, carrier, notes)
     except UserError as error:
@@ -67,10 +69,9 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
         ) from None
     except Exception as error:
         detail = " ".join(str(error).split())[:120]
-        remedy = "as OBJ, or with triangles only" if kind == ".ply" else "with all files it needs"
         raise UserError(
             f"'{path}' is not a readable {kind[1:].upper()} file "
-            f"({type(error).__name__}: {detail}): export the mesh again, {remedy}."
+            f"({type(error).__name__}: {detail}): export the mesh again, with all files it needs."
         ) from None
 
 
@@ -97,9 +98,12 @@ def _read(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
         matrix, name = scene.graph[node]
         shape = scene.geometry[name]
         check_indices(shape.faces, len(shape.vertices))
-        if len(shape.faces) < _declared_faces(kind, data, shape):
+        declared = _declared_faces(kind, data)
+        if len(shape.faces) < declared:
             raise UserError("ends too early: export the mesh again.")
-        if kind in ("ply", "off"):
+        if 0 < declared < len(shape.faces):
+            notes.append("triangulated quads or larger polygons")
+        if kind == "off":
             shape.faces = _in_file_order(np.asarray(shape.faces))
         unused += len(shape.vertices)
         shape.remove_unreferenced_vertices()
@@ -139,10 +143,8 @@ def _read(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
     return np.concatenate(columns["points"]), carrier, notes
 
 
-def _declared_faces(kind: str, data: bytes, shape: trimesh.Trimesh) -> int:
-    """How many a PLY or OFF file promises: trimesh takes what there is of a file cut off."""
-    if kind == "ply":
-        return shape.metadata["_ply_raw"]["face"]["length"]
+def _declared_faces(kind: str, data: bytes) -> int:
+    """How many an OFF file promises: trimesh takes what there is of a file cut off."""
     counts = re.search(rb"^(?:OFF)?[ \t]*\d+[ \t]+(\d+)", data, re.MULTILINE)
     return int(counts[1]) if kind == "off" and counts else 0
 
@@ -186,8 +188,6 @@ def _colors(visual: Any) -> np.ndarray | None:
 
 def _material(visual: Any) -> Any:
     material = getattr(visual, "material", None)
-    if isinstance(material, trimesh.visual.material.SimpleMaterial):  # what a PLY file has
-        return surface("material", material.image) if material.image else None
     return material
 
 

@@ -71,7 +71,7 @@ def weld(name: str, points: np.ndarray, carrier: Carrier, notes: list[str]) -> M
     faces = np.where(flipped[:, None], file_faces[:, ::-1], file_faces)
 
     carrier = replace(carrier, rows=rows, flipped=flipped)
-    columns = (carrier.uv, carrier.normals, carrier.colors, carrier.document)
+    columns = (carrier.uv, carrier.normals, carrier.colors, carrier.ply, carrier.document)
     if all(column is None for column in columns):
         carrier = replace(carrier, corners=file_faces, rows=np.arange(len(vertices)))
     return Mesh(name, vertices, np.ascontiguousarray(faces), tuple(notes), carrier)
