@@ -65,8 +65,8 @@ def valid_glbs(tmp_path_factory):
         pairs[kept] = about
         return kept
 
-    def load_mesh(path):
-        mesh = load(path)
+    def load_mesh(path, *more):
+        mesh = load(path, *more)
         document = mesh.carrier.document if mesh.carrier else None
         if document is not None and document.tree not in held:
             held.append(document.tree)

@@ -1546,6 +1546,27 @@ def _tables() -> None:
     case(group, "groups.obj", "an object, a group and smoothing", groups, WORKS, **BALL)
 
 
+def _rounding() -> None:
+    group = "vertices that rounding tears apart"
+    rng = np.random.default_rng(9)
+    far = (V[F].reshape(-1, 3) + 50).astype(np.float32)
+    way = rng.choice(np.array([-np.inf, np.inf], np.float32), far.shape)
+    soup = np.nextafter(far, way).astype(float), np.arange(len(far)).reshape(-1, 3)
+    for kind, write in (("stl", stl), ("ply", ply), ("obj", obj)):
+        case(group, f"noise.{kind}", "corners off by a unit in the last place of singles",
+             write(*soup), REPAIRED, "joined", **BALL)  # fmt: skip
+    digits = (V[F].reshape(-1, 3) + rng.uniform(-4e-7, 4e-7, (240, 3))).round(6)
+    case(group, "digits.obj", "corners off in the last of six decimals",
+         obj(digits, soup[1]), REPAIRED, "joined", **BALL)  # fmt: skip
+    half = V[F].reshape(-1, 3).copy()
+    half[:120] += [0, 0, 2e-5]
+    case(group, "gap.obj", "two halves wider apart than rounding explains",
+         obj(half, soup[1]), REPAIRED, "nearly coincide", faces=80)  # fmt: skip
+    case(group, "plate.stl", "a closed box a hundred thousand times wider than thick",
+         stl(CUBE * [1, 1, 1e-5], [t for a, b, c, d in QUADS for t in ((a, b, c), (a, c, d))]),
+         WORKS, **BOX)  # fmt: skip
+
+
 def _renamed() -> None:
     group = "files that are something else"
     others = {"junk": JUNK, "text": TEXT, "page": HTML, "picture": picture("PNG")}
@@ -1700,6 +1721,7 @@ for _group in (
     _gltf,
     _gltf_numbers,
     _tables,
+    _rounding,
     _renamed,
     _pictures,
 ):

@@ -21,7 +21,7 @@ IMAGE_SUFFIXES = (
 
 def load_source(config: SourceConfig) -> meshes.Mesh:
     """The source mesh, remeshed if so configured."""
-    mesh = _load("source", config.name, config.path)
+    mesh = _load("source", config.name, config.path, config.weld)
     if not isinstance(mesh, meshes.Mesh):
         raise UserError(f"the source '{config.path or config.name}' is an image: give a mesh.")
     return meshes.remesh(mesh, config.remesh) if config.remesh else mesh
@@ -64,7 +64,9 @@ def locate(kind: str, name: str | None, path: str | None) -> Path | None:
     raise unknown_name(kind, name, known)
 
 
-def _load(kind: str, name: str | None, path: str | None) -> meshes.Mesh | np.ndarray:
+def _load(
+    kind: str, name: str | None, path: str | None, weld: float | None = None
+) -> meshes.Mesh | np.ndarray:
     found = locate(kind, name, path)
     if found is None:
         assert name is not None
@@ -76,7 +78,7 @@ def _load(kind: str, name: str | None, path: str | None) -> meshes.Mesh | np.nda
             f"the style '{found}' ends in '{found.suffix}': give a mesh "
             f"({', '.join(assets.SUFFIXES['mesh'])}) or a picture ({', '.join(IMAGE_SUFFIXES)})."
         )
-    return meshes.load_mesh(found)
+    return meshes.load_mesh(found, weld)
 
 
 def describe(config: Config) -> dict[str, dict[str, str | None]]:

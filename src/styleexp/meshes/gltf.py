@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from styleexp.errors import UserError
-from styleexp.meshes import accessors, gltf_nodes
+from styleexp.meshes import accessors, gltf_nodes, precision
 from styleexp.meshes.accessors import MOST_ZEROS, item
 from styleexp.meshes.gltf_materials import Materials
 from styleexp.meshes.mesh import Carrier
@@ -286,6 +286,7 @@ class _Reader:
             corners,
             np.zeros(self.rows, dtype=np.int64),
             np.zeros(len(corners), dtype=bool),
+            precision=precision.of_floats(self.points()),
             uv=uv,
             normals=self._joined("normals", np.zeros(3)),
             colors=colors,

@@ -26,6 +26,8 @@ class Carrier:
     """Welded vertex of each row."""
     flipped: Bool[np.ndarray, " faces"]
     """Faces that `Mesh.faces` winds the other way round."""
+    precision: float = 0.0
+    """How far apart, in the file's units, positions may be by rounding alone."""
     uv: Float[np.ndarray, "rows 2"] | None = None
     """v points up, as in OBJ and PLY; glTF's points down."""
     normals: Float[np.ndarray, "rows 3"] | None = None

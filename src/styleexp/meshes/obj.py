@@ -15,7 +15,7 @@ import trimesh
 
 from styleexp import images
 from styleexp.errors import UserError
-from styleexp.meshes import references
+from styleexp.meshes import precision, references
 from styleexp.meshes.mesh import Carrier
 from styleexp.meshes.welding import check_indices, plural
 
@@ -114,6 +114,7 @@ def read_obj(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
         inverse.reshape(-1, 3),
         rows[:, 0],
         np.zeros(len(corner), dtype=bool),
+        precision=precision.of_text([word for line in tables["v"] for word in line[:3]], positions),
         uv=_uv(tables["vt"], rows[:, 1]),
         colors=None if colors is None else colors[rows[:, 0]],
         shades=None if shades is None else shades[rows[:, 0]],

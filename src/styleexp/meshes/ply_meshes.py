@@ -11,7 +11,7 @@ import numpy as np
 
 from styleexp import images
 from styleexp.errors import UserError
-from styleexp.meshes import references
+from styleexp.meshes import precision, references
 from styleexp.meshes.mesh import Carrier
 from styleexp.meshes.obj import surface, triangulate
 from styleexp.meshes.ply import Column, Lists, Ply, numbers, parse, take, written
@@ -111,6 +111,7 @@ def read_ply(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
         inverse.reshape(-1, 3),
         np.zeros(len(chosen), dtype=np.int64),
         np.zeros(len(owner), dtype=bool),
+        precision=_precision(data, positions, vertex),
         uv=uv,
         normals=numbers(vertex, *NORMAL)[chosen] if set(NORMAL) <= vertex.keys() else None,
         colors=None if colors is None else colors[chosen],
@@ -122,6 +123,15 @@ def read_ply(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
         ply=kept,
     )
     return positions[chosen], carrier, notes
+
+
+def _precision(data: bytes, positions: np.ndarray, vertex: dict[str, Column]) -> float:
+    head, _, body = data[: 1 << 22].partition(b"end_header")
+    if b"format ascii" in head:
+        words = [row for line in body.splitlines()[1:] for row in line.split()[:3]]
+        return precision.of_text(words[: 3 * len(positions)], positions)
+    single = all(_float(vertex[name]) == np.float32 for name in POSITION)
+    return precision.of_floats(positions) if single else 0.0
 
 
 def ply_of(

@@ -13,23 +13,27 @@ import numpy as np
 import trimesh
 
 from styleexp.errors import UserError
-from styleexp.meshes import whole
+from styleexp.meshes import precision, welding, whole
 from styleexp.meshes.gltf import read_gltf
 from styleexp.meshes.mesh import Carrier, Mesh
 from styleexp.meshes.obj import read_obj
 from styleexp.meshes.ply_meshes import read_ply
 from styleexp.meshes.references import Beside
-from styleexp.meshes.welding import check_indices, plural, weld
+from styleexp.meshes.welding import check_indices, plural
 
 READERS = {".obj": read_obj, ".ply": read_ply, ".glb": read_gltf, ".gltf": read_gltf}
 READABLE = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
 
 
-def load_mesh(path: str | os.PathLike[str]) -> Mesh:
+def load_mesh(path: str | os.PathLike[str], weld: float | None = None) -> Mesh:
     """Load an OBJ, PLY, STL, OFF, GLB or glTF file as one welded triangle mesh.
 
+    ``weld`` is the distance in the file's units within which vertices along open edges are one; 0
+    joins only those at the same position. By default it is what the file's numbers can't tell
+    apart: a few units in the last place of single precision, or of the digits written.
+
     Faces keep the file's order, quads and n-gons triangulated in place (but an OFF file that
-    mixes them gives its triangles first). Vertices at one position become one; vertices that no
+    mixes them gives its triangles first). Vertices that no
     face uses are left out. All geometries of a glTF scene are joined in world space. Parts whose
     faces point inwards, or disagree among themselves, are turned for the optimisation and saved
     with the file's own winding. Open, non-manifold and multi-component meshes are accepted,
@@ -60,7 +64,7 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
         with np.errstate(all="ignore"):
             read = READERS.get(kind, _read)
             points, carrier, notes = read(data, path)
-        return weld(path.stem, points, carrier, notes)
+        return welding.weld(path.stem, points, carrier, notes, weld)
     except UserError as error:
         raise UserError(f"'{path}' {error}") from None
     except MemoryError:
@@ -129,10 +133,12 @@ def _read(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
     if unused:
         notes.append(f"left out {plural(unused, 'vertex', 'vertices')} that no face uses")
     corners = np.concatenate(columns["corners"])
+    positions = np.concatenate(columns["points"])
     carrier = Carrier(
         corners,
         np.zeros(sum(lengths), dtype=np.int64),
         np.zeros(len(corners), dtype=bool),
+        precision=_precision(kind, data, positions),
         uv=_joined(columns["uv"], lengths[1:], np.zeros(2)),
         colors=_joined(columns["colors"], lengths[1:], np.full(4, 255, dtype=np.uint8)),
         parts=tuple(parts),
@@ -140,7 +146,14 @@ def _read(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
         materials=tuple(material for _, material in materials.values()),
         face_material=np.concatenate(columns["material"]),
     )
-    return np.concatenate(columns["points"]), carrier, notes
+    return positions, carrier, notes
+
+
+def _precision(kind: str, data: bytes, points: np.ndarray) -> float:
+    if kind == "stl" and (b"\0" in data[:1000] or b"facet" not in data[:1000]):
+        return precision.of_floats(points)
+    words = data[: 1 << 22].replace(b"\r", b"\n").split()
+    return precision.of_text(words, points)
 
 
 def _declared_faces(kind: str, data: bytes) -> int:
