@@ -1625,6 +1625,53 @@ def _pictures() -> None:
     add("deep.png", "16 bits", picture("PNG", (pixels()[..., 0].astype(np.uint16) * 257)))
     add("deep.tiff", "16 bits", picture("TIFF", (pixels()[..., 0].astype(np.uint16) * 257)))
     add("float.tiff", "32-bit floats", picture("TIFF", pixels()[..., 0].astype(np.float32) / 255))
+    color = pixels().astype(np.uint16) * 257 + 3
+    opaque = np.full((*color.shape[:2], 1), 40000, np.uint16)
+
+    def deep(array, kind="png", **options):
+        def make() -> bytes:
+            import imagecodecs
+            import tifffile
+
+            if kind == "png":
+                return imagecodecs.png_encode(array)
+            out = io.BytesIO()
+            tifffile.imwrite(out, array, **options)
+            return out.getvalue()
+
+        return make
+
+    add("rgb16.png", "16 bits of each colour", deep(color))
+    add(
+        "rgba16.png",
+        "16 bits of each colour and of opacity",
+        deep(np.concatenate([color, opaque], 2)),
+    )
+    add(
+        "la16.png",
+        "16 bits of grey and of opacity",
+        deep(np.concatenate([color[..., :1], opaque], 2)),
+    )
+    add("rgb16.tiff", "16 bits of each colour", deep(color, "tiff", photometric="rgb"))
+    add("lzw16.tiff", "16 bits of each colour, compressed",
+        deep(color, "tiff", photometric="rgb", compression="lzw", predictor=True))  # fmt: skip
+    add("half.tiff", "half-precision floats",
+        deep((pixels() / 255).astype(np.float16), "tiff", photometric="rgb"))  # fmt: skip
+    add("rgbfloat.tiff", "floats of each colour",
+        deep((pixels() / 255).astype(np.float32), "tiff", photometric="rgb"))  # fmt: skip
+    for percent in (30, 90):
+        add(f"deepcut{percent}.png", f"the first {percent} % of 16-bit colours",
+            lambda percent=percent: (whole := deep(color)())[: len(whole) * percent // 100],
+            REFUSED, "damaged or cut short")  # fmt: skip
+        add(f"deepcut{percent}.tiff", f"the first {percent} % of 16-bit colours",
+            lambda percent=percent: (whole := deep(color, "tiff", photometric="rgb")())
+            [: len(whole) * percent // 100],
+            REFUSED, "damaged or cut short")  # fmt: skip
+    bump = np.gradient(pixels()[..., 0] / 40.0)
+    normal = np.stack([-bump[1], -bump[0], np.ones_like(bump[0])], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    add("normalmap.png", "a normal map", picture("PNG", ((normal + 1) * 127.5).astype(np.uint8)),
+        REPAIRED, "normal map")  # fmt: skip
     add(
         "hdr.tiff",
         "floats above 1",

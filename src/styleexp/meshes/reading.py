@@ -1,4 +1,4 @@
-"""Files to meshes: trimesh reads, and one sentence says what is wrong."""
+"""Files to meshes, and one sentence on what is wrong with one; STL and OFF by trimesh."""
 
 from __future__ import annotations
 
