@@ -574,3 +574,12 @@ def test_numbers_that_are_none(tmp_path):
     path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12))
     with pytest.raises(UserError, match="ends too early"):
         meshes.load_mesh(path)
+
+
+def test_the_pages_own_files_are_valid(tmp_path):
+    from styleexp.reports import glb as page
+
+    available(gltf_readers.tools)
+    for k, (values, bare) in enumerate([(None, False), (V[:, 0], False), (None, True)]):
+        (tmp_path / f"{k}.glb").write_bytes(page.glb(V, F, 1.25, values, bare))
+    assert gltf_readers.errors(*sorted(tmp_path.glob("*.glb"))) == [[], [], []]

@@ -79,17 +79,15 @@ def read_ply(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
 
     uv = next((numbers(vertex, *names) for names in UVS if set(names) <= vertex.keys()), None)
     wedges = _wedges(face, counts)
-    columns: list[np.ndarray] = [index[:, None]]
-    if wedges is not None:
+    if wedges is None:
+        chosen, inverse = np.unique(index[corner.ravel()], return_inverse=True)
+        uv = None if uv is None else uv[chosen]
+    else:  # a row is one combination of vertex and texture coordinates
         del face["texcoord"]
-        columns.append(wedges)
-    table, inverse = np.unique(
-        np.column_stack(columns)[corner.ravel()], axis=0, return_inverse=True
-    )
-    chosen = table[:, 0].astype(np.int64)
-    uv = table[:, 1:] if wedges is not None else None if uv is None else uv[chosen]
-    unused = len(positions) - len(np.unique(chosen))
-    if unused:
+        table = np.column_stack([index, wedges])[corner.ravel()]
+        table, inverse = np.unique(table, axis=0, return_inverse=True)
+        chosen, uv = table[:, 0].astype(np.int64), table[:, 1:]
+    if unused := len(positions) - len(np.unique(chosen)):
         notes.append(f"left out {plural(unused, 'vertex', 'vertices')} that no face uses")
     if ply.left:
         notes.append(
