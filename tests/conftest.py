@@ -38,3 +38,59 @@ def named_mesh():
         return path
 
     return find
+
+
+@pytest.fixture(scope="session")
+def valid_glbs(tmp_path_factory):
+    """Fails in the end if a GLB that was written while it was there is not what glTF allows.
+
+    A glTF file's document comes back as it was, so its own errors aren't held against the result.
+    """
+    import shutil
+    from unittest import mock
+
+    import gltf_readers
+
+    from styleexp.meshes import reading, writing
+
+    folder = tmp_path_factory.mktemp("glbs")
+    pairs: dict[Path, Path | None] = {}
+    sources: dict[int, Path] = {}
+    held = []  # so that no other document gets the id of one that is gone
+    load, save = reading.load_mesh, writing.save_mesh
+
+    def copied(path, about):
+        kept = folder / f"{len(list(folder.iterdir()))}{Path(path).suffix}"
+        shutil.copy(path, kept)
+        pairs[kept] = about
+        return kept
+
+    def load_mesh(path, *more):
+        mesh = load(path, *more)
+        document = mesh.carrier.document if mesh.carrier else None
+        if document is not None and document.tree not in held:
+            held.append(document.tree)
+            sources[id(document.tree)] = copied(path, None)
+        return mesh
+
+    def save_mesh(mesh, vertices, path, *more, **named):
+        save(mesh, vertices, path, *more, **named)
+        if str(path).endswith(".glb"):
+            document = mesh.carrier.document if mesh.carrier else None
+            copied(path, sources.get(id(document.tree)) if document is not None else None)
+
+    with (
+        mock.patch.object(reading, "load_mesh", load_mesh),
+        mock.patch.object(writing, "save_mesh", save_mesh),
+    ):
+        yield
+    available(gltf_readers.tools)
+    found = dict(zip(pairs, gltf_readers.errors(*pairs), strict=True)) if pairs else {}
+    own = {path: {line.split()[0] for line in lines} for path, lines in found.items()}
+    own[None] = set()
+    wrong = {
+        str(path): lines
+        for path, lines in found.items()
+        if path not in sources.values() and own[path] - own[pairs[path]]
+    }
+    assert not wrong

@@ -364,13 +364,14 @@ def _counts() -> None:
             )
             number_faces = {"fewer": 60}.get(name, number + 40)
             if name != "fewer":
-                some = name == "minus" and short == "ascii"
+                some = name == "minus"
                 case(
                     group,
                     f"faces-{name}-{short}.ply",
                     f"{number_faces} faces promised, 80 there",
                     ply(kind=kind, face_count=number_faces),
                     REPAIRED if some else REFUSED,
+                    "after its last element" if some else "",
                 )
         whole = off().split(b"\n", 2)
         case(
@@ -694,8 +695,8 @@ def _topology() -> None:
             f"quads.{kind}",
             "quads",
             write(CUBE, QUADS),
-            REPAIRED if kind == "obj" else WORKS,
-            "triangulated" if kind == "obj" else "",
+            REPAIRED,
+            "triangulated",
             **BOX,
         )
     case(
@@ -712,15 +713,17 @@ def _topology() -> None:
         "mixed.ply",
         "triangles and quads, binary",
         ply(CUBE, [*QUADS[:5], *[(1, 5, 7), (1, 7, 3)]]),
-        REFUSED,
-        "with triangles only",
+        REPAIRED,
+        "triangulated 5 quads",
+        **BOX,
     )
     case(
         group,
         "mixed.off",
         "triangles and quads",
         off(CUBE, [*QUADS[:5], *[(1, 5, 7), (1, 7, 3)]]),
-        WORKS,
+        REPAIRED,
+        "triangulated",
         **BOX,
     )
     circle = np.array([(np.cos(a), np.sin(a), 0) for a in np.arange(500) * np.pi / 250])
@@ -758,7 +761,8 @@ def _topology() -> None:
         "lines.obj",
         "lines and points among the faces",
         obj(after="l 1 2 3\np 4\n"),
-        WORKS,
+        REPAIRED,
+        "(l, p)",
         **BALL,
     )
     case(
@@ -1241,7 +1245,13 @@ def _gltf() -> None:
         WORKS,
     )
     skin = {"skins": [{"joints": [0]}]}
-    build("skin", "a skin", lambda d: (d.update(skin), d["nodes"][0].update(skin=0)), WORKS)
+    build(
+        "skin",
+        "a node with a skin, whose mesh has no joints",
+        lambda d: (d.update(skin), d["nodes"][0].update(skin=0)),
+        REPAIRED,
+        "kept skins",
+    )
     build(
         "animation",
         "an animation",
@@ -1253,9 +1263,16 @@ def _gltf() -> None:
                 }
             ]
         ),
-        WORKS,
+        REPAIRED,
+        "kept animations",
     )
-    build("morph", "a morph target", primitive(targets=[{"POSITION": 0}]), WORKS)
+    build(
+        "morph",
+        "a morph target",
+        primitive(targets=[{"POSITION": 0}]),
+        REPAIRED,
+        "kept morph targets",
+    )
     build(
         "camera",
         "a camera and no mesh",
@@ -1384,6 +1401,172 @@ def _gltf() -> None:
     )
 
 
+def _gltf_numbers() -> None:
+    group = "numbers of glTF"
+
+    def build(name, what, columns=(), change=None, outcome=WORKS, says="", **more):
+        """``columns``: attribute, numbers, component type, normalised."""
+        document, buffer = gltf_parts()
+        for attribute, values, kind, normalised in columns:
+            buffer += bytes(-len(buffer) % 4)
+            content = np.ascontiguousarray(values)
+            document["bufferViews"].append(
+                {"buffer": 0, "byteOffset": len(buffer), "byteLength": content.nbytes}
+            )
+            buffer += content.tobytes()
+            accessor = {
+                "bufferView": len(document["bufferViews"]) - 1,
+                "componentType": kind,
+                "count": len(content),
+                "type": {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}[content.shape[1]],
+            }
+            document["accessors"].append(accessor | ({"normalized": True} if normalised else {}))
+            primitive = document["meshes"][0]["primitives"][0]
+            primitive["attributes"][attribute] = len(document["accessors"]) - 1
+        document["buffers"][0]["byteLength"] = len(buffer)
+        if change is not None:
+            change(document)
+        known = BALL if outcome != REFUSED else {}
+        content = glb(document, buffer)
+        case(group, f"{name}.glb", what, content, outcome, says, **{**known, **more})
+
+    share = (V[:, :2] + 1) / 2
+    build("uvfloat", "texture coordinates without a material",
+          [("TEXCOORD_0", share.astype("<f4"), 5126, False)])  # fmt: skip
+    padded = np.pad((share * 255).astype("u1"), ((0, 0), (0, 2)))
+    build("uvbyte", "texture coordinates of 8 bits, in strides",
+          [("TEXCOORD_0", padded, 5121, True)],
+          lambda d: (d["accessors"][2].update(type="VEC2"),
+                     d["bufferViews"][2].update(byteStride=4)))  # fmt: skip
+    build("uvshort", "texture coordinates of 16 bits",
+          [("TEXCOORD_0", (share * 65535).astype("<u2"), 5123, True)])  # fmt: skip
+    color = ((V + 1) / 2 * 65535).astype("<u2")
+    opaque = np.pad(color, ((0, 0), (0, 1)), constant_values=65535)
+    build("color16", "colours of 16 bits", [("COLOR_0", opaque, 5123, True)])
+    build("colorfloat", "colours of floats, without opacity",
+          [("COLOR_0", (color / 65535).astype("<f4"), 5126, False)])  # fmt: skip
+    build("second", "a second set of texture coordinates, tangents",
+          [("TEXCOORD_0", share.astype("<f4"), 5126, False),
+           ("TEXCOORD_1", share[::-1].astype("<f4"), 5126, False),
+           ("NORMAL", V.astype("<f4"), 5126, False),
+           ("TANGENT", np.pad(V[:, [1, 2, 0]], ((0, 0), (0, 1)), constant_values=1).astype("<f4"),
+            5126, False)])  # fmt: skip
+    short = np.pad(np.round(V * 32767).astype("<i2"), ((0, 0), (0, 1)))
+
+    def quantised(document: dict) -> None:
+        document["accessors"][2]["type"] = "VEC3"
+        document["bufferViews"][2]["byteStride"] = 8
+        document["extensionsRequired"] = document["extensionsUsed"] = ["KHR_mesh_quantization"]
+
+    build("quantised", "positions of 16 bits (KHR_mesh_quantization)",
+          [("POSITION", short, 5122, True)], quantised)  # fmt: skip
+
+    def sparse(document: dict) -> None:
+        # The second column's view holds the indices, the third's the values.
+        document["accessors"][0]["sparse"] = {
+            "count": 3,
+            "indices": {"bufferView": 2, "componentType": 5121},
+            "values": {"bufferView": 3},
+        }
+        attributes = document["meshes"][0]["primitives"][0]["attributes"]
+        del attributes["_INDICES"], attributes["_VALUES"]
+
+    parts = [("_INDICES", np.array([[1], [5], [7]], "u1"), 5121, False),
+             ("_VALUES", (V[[1, 5, 7]] * 1.1).astype("<f4"), 5126, False)]  # fmt: skip
+    build("sparse", "sparse positions", parts, sparse)
+    build("sparsebeyond", "a sparse position beyond the last",
+          [("_INDICES", np.array([[1], [5], [99]], "u1"), 5121, False), parts[1]], sparse,
+          REFUSED, "element 99 of 42")  # fmt: skip
+    build("fewcolors", "fewer colours than vertices",
+          [("COLOR_0", color[:9], 5123, True)], None, REFUSED, "9 elements")  # fmt: skip
+    build("stride", "a stride shorter than its elements", (),
+          lambda d: d["bufferViews"][0].update(byteStride=4), REFUSED, "than it holds")  # fmt: skip
+    build("instances", "a hundred thousand nodes that show one mesh", (),
+          lambda d: d.update(nodes=[{"mesh": 0}] * 100_000,
+                             scenes=[{"nodes": list(range(100_000))}]),
+          REFUSED, "so often")  # fmt: skip
+    build("diamond", "nodes below two others, 2^60 ways to the mesh", (),
+          lambda d: d.update(nodes=[*({"children": [k + 1, k + 1]} for k in range(60)),
+                                    {"mesh": 0}]),
+          REFUSED, "below two others")  # fmt: skip
+    instancing = {"EXT_mesh_gpu_instancing": {"attributes": {}}}
+    build("instancing", "instances by an extension that isn't required", (),
+          lambda d: d["nodes"][0].update(extensions=instancing),
+          REFUSED, "EXT_mesh_gpu_instancing")  # fmt: skip
+
+
+def _tables() -> None:
+    group = "what PLY and OBJ files have besides"
+    head, body = ply(kind="ascii").split(b"end_header\n")
+    rows = body.splitlines()
+
+    def wider(vertex=b"", face=b"", values=b"", face_values=b"", after=b"", element=b"") -> bytes:
+        """The ball with more properties, all rows with the same numbers."""
+        top = head.replace(b"element face", vertex + b"element face") + face + element
+        lines = [row + values for row in rows[:42]] + [row + face_values for row in rows[42:]]
+        return top + b"end_header\n" + b"\n".join(lines) + b"\n" + after
+
+    def one(*names: str, kind="float") -> bytes:
+        return "".join(f"property {kind} {name}\n" for name in names).encode()
+
+    lists = b"property list uchar float weights\n"
+    case(group, "confidence.ply", "vertices' confidence and label",
+         wider(one("confidence") + one("label", kind="int"), values=b" 0.5 7"),
+         REPAIRED, "vertex properties (confidence, label)", **BALL)  # fmt: skip
+    case(group, "segment.ply", "faces' segment", wider(face=one("segment"), face_values=b" 3"),
+         REPAIRED, "GLB none for face properties (segment)", **BALL)  # fmt: skip
+    case(group, "lists.ply", "a list for each vertex", wider(lists, values=b" 2 0.5 0.5"),
+         REPAIRED, "weights", **BALL)  # fmt: skip
+    case(group, "facecolors.ply", "faces' colours",
+         wider(face=one("red", "green", "blue", kind="uchar"), face_values=b" 9 99 199"),
+         REPAIRED, "face colours", **BALL)  # fmt: skip
+    case(group, "normals.ply", "vertices' normals",
+         wider(one("nx", "ny", "nz"), values=b" 0 0 1"), WORKS, **BALL)  # fmt: skip
+    case(group, "uvcolors.ply", "texture coordinates and colours",
+         wider(one("s", "t") + one("red", "green", "blue", kind="uchar"), values=b" .5 .1 9 9 9"),
+         WORKS, **BALL)  # fmt: skip
+    case(group, "edges.ply", "an element of edges",
+         wider(element=b"element edge 1\n" + one("vertex1", "vertex2", kind="int"), after=b"0 1\n"),
+         REPAIRED, "element 'edge'", **BALL)  # fmt: skip
+    strips = ply(faces=[], kind="ascii").replace(b"face 0", b"tristrips 1") + b"4 0 1 2 3\n"
+    case(group, "strips.ply", "triangle strips", strips, REFUSED, "triangle strips")
+    case(group, "type.ply", "a number that its type can't hold",
+         wider(one("label", kind="uchar"), values=b" 300"), REFUSED, "cannot hold")  # fmt: skip
+    lines = obj().split(b"\n")
+
+    def colored(weight: bytes, every: int) -> bytes:
+        color = [line + weight + b" 0.5 0.25 0.125" * (k % every == 0)
+                 for k, line in enumerate(lines[:42])]  # fmt: skip
+        return b"\n".join([*color, *lines[42:]])
+
+    case(group, "colors.obj", "colours after three coordinates", colored(b"", 1), WORKS, **BALL)
+    case(group, "colors4.obj", "colours after four", colored(b" 1.0", 1), WORKS, **BALL)
+    case(group, "somecolors.obj", "colours on some vertices", colored(b"", 3), WORKS, **BALL)
+    groups = obj().replace(b"\nf", b"\no hull\ng left\ns 1\nf", 1)
+    case(group, "groups.obj", "an object, a group and smoothing", groups, WORKS, **BALL)
+
+
+def _rounding() -> None:
+    group = "vertices that rounding tears apart"
+    rng = np.random.default_rng(9)
+    far = (V[F].reshape(-1, 3) + 50).astype(np.float32)
+    way = rng.choice(np.array([-np.inf, np.inf], np.float32), far.shape)
+    soup = np.nextafter(far, way).astype(float), np.arange(len(far)).reshape(-1, 3)
+    for kind, write in (("stl", stl), ("ply", ply), ("obj", obj)):
+        case(group, f"noise.{kind}", "corners off by a unit in the last place of singles",
+             write(*soup), REPAIRED, "joined", **BALL)  # fmt: skip
+    digits = (V[F].reshape(-1, 3) + rng.uniform(-4e-7, 4e-7, (240, 3))).round(6)
+    case(group, "digits.obj", "corners off in the last of six decimals",
+         obj(digits, soup[1]), REPAIRED, "joined", **BALL)  # fmt: skip
+    half = V[F].reshape(-1, 3).copy()
+    half[:120] += [0, 0, 2e-5]
+    case(group, "gap.obj", "two halves wider apart than rounding explains",
+         obj(half, soup[1]), REPAIRED, "nearly coincide", faces=80)  # fmt: skip
+    case(group, "plate.stl", "a closed box a hundred thousand times wider than thick",
+         stl(CUBE * [1, 1, 1e-5], [t for a, b, c, d in QUADS for t in ((a, b, c), (a, c, d))]),
+         WORKS, **BOX)  # fmt: skip
+
+
 def _renamed() -> None:
     group = "files that are something else"
     others = {"junk": JUNK, "text": TEXT, "page": HTML, "picture": picture("PNG")}
@@ -1442,6 +1625,53 @@ def _pictures() -> None:
     add("deep.png", "16 bits", picture("PNG", (pixels()[..., 0].astype(np.uint16) * 257)))
     add("deep.tiff", "16 bits", picture("TIFF", (pixels()[..., 0].astype(np.uint16) * 257)))
     add("float.tiff", "32-bit floats", picture("TIFF", pixels()[..., 0].astype(np.float32) / 255))
+    color = pixels().astype(np.uint16) * 257 + 3
+    opaque = np.full((*color.shape[:2], 1), 40000, np.uint16)
+
+    def deep(array, kind="png", **options):
+        def make() -> bytes:
+            import imagecodecs
+            import tifffile
+
+            if kind == "png":
+                return imagecodecs.png_encode(array)
+            out = io.BytesIO()
+            tifffile.imwrite(out, array, **options)
+            return out.getvalue()
+
+        return make
+
+    add("rgb16.png", "16 bits of each colour", deep(color))
+    add(
+        "rgba16.png",
+        "16 bits of each colour and of opacity",
+        deep(np.concatenate([color, opaque], 2)),
+    )
+    add(
+        "la16.png",
+        "16 bits of grey and of opacity",
+        deep(np.concatenate([color[..., :1], opaque], 2)),
+    )
+    add("rgb16.tiff", "16 bits of each colour", deep(color, "tiff", photometric="rgb"))
+    add("lzw16.tiff", "16 bits of each colour, compressed",
+        deep(color, "tiff", photometric="rgb", compression="lzw", predictor=True))  # fmt: skip
+    add("half.tiff", "half-precision floats",
+        deep((pixels() / 255).astype(np.float16), "tiff", photometric="rgb"))  # fmt: skip
+    add("rgbfloat.tiff", "floats of each colour",
+        deep((pixels() / 255).astype(np.float32), "tiff", photometric="rgb"))  # fmt: skip
+    for percent in (30, 90):
+        add(f"deepcut{percent}.png", f"the first {percent} % of 16-bit colours",
+            lambda percent=percent: (whole := deep(color)())[: len(whole) * percent // 100],
+            REFUSED, "damaged or cut short")  # fmt: skip
+        add(f"deepcut{percent}.tiff", f"the first {percent} % of 16-bit colours",
+            lambda percent=percent: (whole := deep(color, "tiff", photometric="rgb")())
+            [: len(whole) * percent // 100],
+            REFUSED, "damaged or cut short")  # fmt: skip
+    bump = np.gradient(pixels()[..., 0] / 40.0)
+    normal = np.stack([-bump[1], -bump[0], np.ones_like(bump[0])], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    add("normalmap.png", "a normal map", picture("PNG", ((normal + 1) * 127.5).astype(np.uint8)),
+        REPAIRED, "normal map")  # fmt: skip
     add(
         "hdr.tiff",
         "floats above 1",
@@ -1536,6 +1766,9 @@ for _group in (
     _text,
     _materials,
     _gltf,
+    _gltf_numbers,
+    _tables,
+    _rounding,
     _renamed,
     _pictures,
 ):

@@ -12,7 +12,7 @@ from trying import OVERRIDES, check
 
 ROOT = Path(__file__).parent.parent
 
-pytestmark = pytest.mark.filterwarnings("ignore")
+pytestmark = [pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("valid_glbs")]
 
 
 @pytest.fixture(scope="session")

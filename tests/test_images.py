@@ -216,3 +216,167 @@ def test_luminance_of_arrays_and_tensors():
     np.testing.assert_allclose(grey, expected, atol=1 / 255)
     np.testing.assert_allclose(luminance(torch.from_numpy(rgb)).numpy(), grey, rtol=1e-6)
     assert luminance(np.full(3, 0.25)) == pytest.approx(0.25)
+
+
+# ------------------------------------------------------------------------------------ deep colours
+
+DEEP = np.random.default_rng(1).integers(0, 65536, (20, 30, 4), dtype=np.uint16)
+
+
+def over(values, background):
+    """What any colours with opacity are over a grey, all in [0, 1]."""
+    values = values / 65535.0
+    return values[..., :-1] * values[..., -1:] + background * (1 - values[..., -1:])
+
+
+def write_png(path, values):
+    """A PNG of 16 bits by zlib alone, its rows filtered in all five ways."""
+    import struct
+    import zlib
+
+    height, width, samples = values.shape
+    rows, size = values.astype(">u2").tobytes(), width * samples * 2
+    step, before, body = samples * 2, bytes(size), b""
+    for y in range(height):
+        row = rows[y * size : (y + 1) * size]
+        left, corner = bytes(step) + row[:-step], bytes(step) + before[:-step]
+        kind = y % 5
+
+        def paeth(a, b, c):
+            return min((abs(b - c), 0, a), (abs(a - c), 1, b), (abs(a + b - 2 * c), 2, c))[2]
+
+        guess = [bytes(size), left, before,
+                 bytes((a + b) // 2 for a, b in zip(left, before, strict=True)),
+                 bytes(map(paeth, left, before, corner))][kind]  # fmt: skip
+        body += bytes([kind]) + bytes((x - g) % 256 for x, g in zip(row, guess, strict=True))
+        before = row
+
+    def chunk(name, data):
+        check = struct.pack(">I", zlib.crc32(name + data))
+        return struct.pack(">I", len(data)) + name + data + check
+
+    color = {1: 0, 2: 4, 3: 2, 4: 6}[samples]
+    head = struct.pack(">IIBBBBB", width, height, 16, color, 0, 0, 0)
+    parts = (b"IHDR", head), (b"IDAT", zlib.compress(body)), (b"IEND", b"")
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts))
+
+
+@pytest.mark.parametrize("samples", [1, 2, 3, 4])
+def test_sixteen_bits_of_a_png_are_kept(tmp_path, samples):
+    path = tmp_path / "a.png"
+    values = DEEP[..., :samples]
+    write_png(path, values)
+    for background in (1.0, 0.25):
+        wanted = values / 65535.0 if samples in (1, 3) else over(values, background)
+        pixels = load_image(path, background=background)
+        assert (pixels.shape, pixels.dtype) == ((20, 30, 3), np.float32)
+        np.testing.assert_allclose(pixels, np.broadcast_to(wanted, (20, 30, 3)), atol=1e-6)
+
+
+@pytest.mark.parametrize("options", [{}, {"compression": "zlib", "predictor": True},
+                                     {"compression": "lzw"}, {"planarconfig": "separate"},
+                                     {"byteorder": ">"}, {"tile": (16, 16)}])  # fmt: skip
+@pytest.mark.parametrize("samples", [3, 4])
+def test_sixteen_bits_of_a_tiff_are_kept(tmp_path, samples, options):
+    import tifffile
+
+    values, extra = DEEP[..., :samples], {"extrasamples": ["unassalpha"]} if samples == 4 else {}
+    stored = np.moveaxis(values, -1, 0) if "planarconfig" in options else values
+    tifffile.imwrite(tmp_path / "a.tiff", stored, photometric="rgb", **extra, **options)
+    wanted = values / 65535.0 if samples == 3 else over(values, 0.25)
+    np.testing.assert_allclose(load_image(tmp_path / "a.tiff", background=0.25), wanted, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["f2", "f4", "f8"])
+@pytest.mark.parametrize("colors", [1, 3])
+def test_floats_of_any_precision(tmp_path, kind, colors):
+    import tifffile
+
+    values = np.random.default_rng(2).random((20, 30, colors)).astype(kind)
+    meaning = "rgb" if colors == 3 else "minisblack"
+    stored = values if colors == 3 else values[..., 0]
+    tifffile.imwrite(tmp_path / "a.tiff", stored, photometric=meaning)
+    wanted = np.broadcast_to(values.astype(float), (20, 30, 3))
+    np.testing.assert_allclose(load_image(tmp_path / "a.tiff"), wanted, atol=1e-6)
+    tifffile.imwrite(tmp_path / "a.tiff", stored * 2, photometric=meaning)
+    with pytest.raises(UserError, match=r"outside \[0, 1\]"):
+        load_image(tmp_path / "a.tiff")
+
+
+def test_other_meanings_and_ways_round(tmp_path):
+    import tifffile
+
+    path = tmp_path / "a.tiff"
+    grey = DEEP[..., 0]
+    tifffile.imwrite(path, grey, photometric="miniswhite")
+    np.testing.assert_allclose(load_image(path)[..., 1], 1 - grey / 65535.0, atol=1e-6)
+    tifffile.imwrite(path, DEEP, photometric="separated")
+    wanted = (1 - DEEP[..., :3] / 65535.0) * (1 - DEEP[..., 3:] / 65535.0)
+    np.testing.assert_allclose(load_image(path), wanted, atol=1e-6)
+    multiplied = np.minimum(DEEP, DEEP[..., 3:])
+    tifffile.imwrite(path, multiplied, photometric="rgb", extrasamples=["assocalpha"])
+    wanted = multiplied[..., :3] / 65535.0 + 1 - multiplied[..., 3:] / 65535.0
+    np.testing.assert_allclose(load_image(path), wanted, atol=1e-6)
+    plain = Image.fromarray(COLOUR)
+    for turn in range(1, 9):  # as Pillow turns the same
+        exif = plain.getexif()
+        exif[0x0112] = turn
+        plain.save(tmp_path / "b.png", exif=exif)
+        tags = [(274, "H", 1, turn, True)]
+        tifffile.imwrite(path, COLOUR.astype(np.uint16) * 257, photometric="rgb", extratags=tags)
+        np.testing.assert_allclose(load_image(path), load_image(tmp_path / "b.png"), atol=1e-6)
+    tifffile.imwrite(path, np.stack([DEEP[..., :3]] * 2), photometric="rgb")
+    with pytest.warns(UserWarning, match="first of 2 frames"):
+        load_image(path)
+
+
+def test_a_vast_deep_tiff_is_refused_before_it_is_decoded(tmp_path):
+    import tifffile
+
+    vast = np.broadcast_to(np.uint16(7), (12_000, 12_000, 3))
+    tifffile.imwrite(tmp_path / "a.tiff", vast, photometric="rgb", compression="zlib")
+    with pytest.raises(UserError, match="pixels"):
+        load_image(tmp_path / "a.tiff")
+
+
+def normal_map(height, tilt=1.0, flip=1):
+    down, right = np.gradient(height)
+    normals = np.stack([-right * tilt, -flip * down * tilt, np.ones_like(down)], axis=-1)
+    return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+
+
+@pytest.mark.parametrize("tilt", [0.5, 1.0, 3.0])
+@pytest.mark.parametrize("flip", [1, -1])
+def test_a_normal_map_is_recognised_and_said_so(tmp_path, tilt, flip):
+    y, x = np.mgrid[0:64, 0:64]
+    normals = normal_map(3 * np.sin(x / 4) * np.cos(y / 5), tilt, flip)
+    path = tmp_path / "a.png"
+    Image.fromarray(((normals + 1) * 127.5).round().astype(np.uint8)).save(path)
+    with pytest.warns(UserWarning, match="looks like a normal map: its colours are read as tone"):
+        load_image(path)
+
+
+def test_other_pictures_are_no_normal_maps(tmp_path, recwarn):
+    y, x = np.mgrid[0:64, 0:64]
+    wave = (np.sin(x / 4) * np.cos(y / 5) + 1) / 2
+    sky = np.stack([0.5 + 0.2 * wave, 0.6 + 0.2 * wave, 0.95 + 0 * wave], axis=-1)
+    light = np.repeat((0.75 + 0.1 * wave)[..., None], 3, axis=-1)
+    height = np.repeat(wave[..., None], 3, axis=-1)
+    for k, picture in enumerate((sky, light, height, COLOUR / 255.0, smooth_colour() / 255.0)):
+        Image.fromarray((picture * 255).astype(np.uint8)).save(tmp_path / f"{k}.png")
+        load_image(tmp_path / f"{k}.png")
+    assert not [w for w in recwarn if "normal map" in str(w.message)]
+
+
+def test_deep_colours_load_their_libraries_only_when_needed(tmp_path):
+    import subprocess
+    import sys
+
+    Image.fromarray(COLOUR).save(tmp_path / "a.tiff")
+    Image.fromarray(COLOUR).save(tmp_path / "a.png")
+    code = (
+        "import sys; from styleexp.images import load_image\n"
+        f"load_image({str(tmp_path / 'a.png')!r}); load_image({str(tmp_path / 'a.tiff')!r})\n"
+        "assert not {'imagecodecs', 'tifffile'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -126,13 +126,11 @@ def held_out_losses(run: Path, results: list[np.ndarray]) -> list[float] | list[
 
 def _result(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices, faces and displacement of a result, as they stand in its file."""
-    import numpy as np
-    import trimesh
+    from styleexp.meshes.ply import stored_result
 
-    mesh = trimesh.load(path, process=False)
-    stored = mesh.metadata["_ply_raw"]["vertex"]["data"]  # where trimesh keeps custom properties
-    displacement = np.asarray(stored["displacement"], dtype=float).ravel()
-    return np.asarray(mesh.vertices), np.asarray(mesh.faces), displacement
+    vertices, faces, displacement = stored_result(path.read_bytes())
+    assert displacement is not None
+    return vertices, faces, displacement
 
 
 def _views(first: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

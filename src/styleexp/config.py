@@ -24,6 +24,9 @@ class SourceConfig:
     """A named asset or analytic shape (``styleexp-assets list``)."""
     path: str | None = None
     """A mesh file; wins over ``name``."""
+    weld: float | None = None
+    """Join vertices along open edges that lie within this distance, in the file's units: 0 only
+    those at the same position; null what the file's numbers can't tell apart."""
     remesh: int | None = None
     """Remesh to about this many vertices first (attributes are lost); null keeps the mesh."""
 
@@ -306,6 +309,7 @@ POSITIVE = (
 )
 
 BETWEEN = {
+    "source.weld": (0.0, 1e100),
     "source.remesh": (100, 10_000_000),
     "style.scale": (1e-3, 1e3),
     "style.image_tile": (1e-3, 1e3),

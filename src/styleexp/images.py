@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from styleexp import deep_images
 from styleexp.errors import UserError
 
 if TYPE_CHECKING:
@@ -27,10 +28,11 @@ TEXTURE_FORMATS = (*FORMATS, "TGA", "DDS", "MPO")
 def load_image(path: str | Path, *, background: float = 1.0) -> Float[np.ndarray, "height width 3"]:
     """Read a picture as float32 RGB in [0, 1], row 0 at the top.
 
-    PNG, JPEG, WebP, TIFF and others (:data:`FORMATS`): colour, grey, palette, CMYK, 16-bit grey
-    (scaled by 65535; 16-bit colour keeps its upper 8 bits), 32-bit float TIFF within [0, 1]. The
-    EXIF rotation is applied, an animation gives its first frame. Values are as stored
-    (sRGB-coded); colour profiles are not applied.
+    PNG, JPEG, WebP, TIFF and others (:data:`FORMATS`): colour, grey, palette, CMYK, with and
+    without opacity; PNG and TIFF with all of their 16 bits (scaled by 65535), TIFF of half, single
+    and double precision within [0, 1]. The EXIF rotation is applied, an animation gives its first
+    frame. Values are as stored (sRGB-coded); colour profiles are not applied. A warning tells where
+    a picture looks like a normal map, whose colours are directions and no tone.
 
     Args:
         path: the file. Its name does not matter, its content does.
@@ -59,6 +61,14 @@ def load_image(path: str | Path, *, background: float = 1.0) -> Float[np.ndarray
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             Image.init()
             readable = [name for name in FORMATS if name in Image.OPEN]
+            deep = None
+            if deep_images.is_tiff(head) and _deep(path):
+                limits = Image.MAX_IMAGE_PIXELS, MIN_SIDE
+                deep = deep_images.read_tiff(path, background, *limits)
+            if deep is not None:
+                pixels, frames = deep
+                _one_of(frames, path)
+                return _told(pixels, path)
             with Image.open(path, formats=readable) as image:
                 if min(image.size) < MIN_SIDE:
                     raise UserError(
@@ -66,10 +76,13 @@ def load_image(path: str | Path, *, background: float = 1.0) -> Float[np.ndarray
                         f"it needs at least {MIN_SIDE} on each side."
                     )
                 frames = getattr(image, "n_frames", 1)
-                if frames > 1 and image.format != "MPO":  # a phone's MPO holds a thumbnail, too
-                    told = f"'{path}' is an animation or has pages: the first of {frames} frames"
-                    warnings.warn(f"{told} is taken.", stacklevel=2)
-                pixels = _rgb(ImageOps.exif_transpose(image), path, background)
+                if image.format != "MPO":  # a phone's MPO holds a thumbnail, too
+                    _one_of(frames, path)
+                if deep_images.is_png(head):
+                    turn = image.getexif().get(0x0112, 1)
+                    pixels = deep_images.read_png(path, background, turn)
+                else:
+                    pixels = _rgb(ImageOps.exif_transpose(image), path, background)
     except UserError:
         raise
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
@@ -86,6 +99,29 @@ def load_image(path: str | Path, *, background: float = 1.0) -> Float[np.ndarray
         raise UserError(
             f"the image '{path}' is damaged or cut short and cannot be decoded ({reason})."
         ) from error
+    return _told(pixels, path)
+
+
+def is_normal_map(rgb: Float[np.ndarray, "height width 3"]) -> bool:
+    """Whether colours are unit vectors on one side of a surface, as ``rgb = (n + 1) / 2``.
+
+    Nearly all are of length 1 and point up, and they point up on the whole.
+    """
+    step = max(1, int(np.sqrt(rgb.shape[0] * rgb.shape[1] / 250_000)))
+    normals = 2.0 * rgb[::step, ::step].reshape(-1, 3) - 1.0
+    unit = np.abs(np.linalg.norm(normals, axis=1) - 1.0) < 0.1
+    x, y, z = normals.mean(axis=0)
+    upward = (normals[:, 2] > 0).mean() > 0.99
+    return bool(unit.mean() > 0.95 and upward and z > 0.6 and max(abs(x), abs(y)) < 0.2)
+
+
+def _told(pixels: np.ndarray, path: Path) -> np.ndarray:
+    if is_normal_map(pixels):
+        warnings.warn(
+            f"'{path}' looks like a normal map: its colours are read as tone, not as directions; a "
+            "height map or a photograph of the material serves better.",
+            stacklevel=3,
+        )
     return pixels
 
 
@@ -121,6 +157,23 @@ def from_array(picture: np.ndarray) -> Float[np.ndarray, "height width 3"]:
         alpha = values[..., 3:]
         values = values[..., :3] * alpha + (1 - alpha)
     return np.repeat(values, 3, axis=2) if values.shape[2] == 1 else values
+
+
+def _one_of(frames: int, path: Path) -> None:
+    if frames > 1:
+        told = f"'{path}' is an animation or has pages: the first of {frames} frames"
+        warnings.warn(f"{told} is taken.", stacklevel=3)
+
+
+def _deep(path: Path) -> bool:
+    """Whether a TIFF has more than eight bits a sample, or is none that Pillow knows."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path, formats=["TIFF"]) as image:
+            return max(image.tag_v2.get(258, (1,))) > 8  # type: ignore[attr-defined]
+    except UnidentifiedImageError:
+        return True
 
 
 def fault(content: bytes) -> str:

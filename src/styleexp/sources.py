@@ -71,7 +71,7 @@ def _check_suffix(kind: str, path: Path) -> None:
 
 def load_source(config: SourceConfig) -> meshes.Mesh:
     """The source mesh, remeshed if so configured."""
-    mesh = _load("source", config.name, config.path)
+    mesh = _load("source", config.name, config.path, config.weld)
     if not isinstance(mesh, meshes.Mesh):
         raise UserError(f"the source '{config.path or config.name}' is an image: give a mesh.")
     if not config.remesh:
@@ -117,7 +117,9 @@ def locate(kind: str, name: str | None, path: str | None) -> Path | None:
     raise unknown_name(kind, name, known)
 
 
-def _load(kind: str, name: str | None, path: str | None) -> meshes.Mesh | np.ndarray:
+def _load(
+    kind: str, name: str | None, path: str | None, weld: float | None = None
+) -> meshes.Mesh | np.ndarray:
     if kind in _GIVEN.get():
         return _GIVEN.get()[kind]
     found = locate(kind, name, path)
@@ -133,4 +135,4 @@ def _load(kind: str, name: str | None, path: str | None) -> meshes.Mesh | np.nda
             f"the style '{found}' ends in '{found.suffix}': give a mesh "
             f"({', '.join(assets.SUFFIXES['mesh'])}) or a picture ({', '.join(IMAGE_SUFFIXES)})."
         )
-    return meshes.load_mesh(found)
+    return meshes.load_mesh(found, weld)

@@ -2,14 +2,15 @@
 
 A file and an optimiser want different things of a mesh. The optimiser wants one vertex per point of
 the surface, so that a displacement cannot tear it open; a file keeps several wherever a texture,
-an edge or a colour has a seam. `load_mesh` welds by position and remembers the file's own rows,
-materials and nodes in a `Carrier`; `save_mesh` puts moved vertices back into them::
+an edge or a colour has a seam. `load_mesh` welds by position and remembers the file's own rows and
+all else that it holds in a `Carrier`; `save_mesh` puts moved vertices back into them::
 
     file rows (position, uv, normal, colour)  ── weld ──►  Mesh.vertices  ── optimise ──┐
               ▲                                                                         │
               └─────────────────────────── un-weld (Carrier.rows) ◄─────────────────────┘
 
-trimesh reads and writes every format but OBJ, whose faces it would group by material.
+glTF (`gltf`, `gltf_writing`), PLY (`ply`, `ply_meshes`) and OBJ (`obj`) are read and written here,
+as no library gives back all that a file has; STL and OFF are read by trimesh.
 
 Coordinates are float64 in the file's frame and scale, a glTF scene's in its world frame. Faces wind
 counter-clockwise seen from outside.

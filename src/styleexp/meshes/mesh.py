@@ -26,10 +26,12 @@ class Carrier:
     """Welded vertex of each row."""
     flipped: Bool[np.ndarray, " faces"]
     """Faces that `Mesh.faces` winds the other way round."""
+    precision: float = 0.0
+    """How far apart, in the file's units, positions may be by rounding alone."""
     uv: Float[np.ndarray, "rows 2"] | None = None
     """v points up, as in OBJ and PLY; glTF's points down."""
     normals: Float[np.ndarray, "rows 3"] | None = None
-    """A glTF file's: they say which corners are smooth together, not where they point now."""
+    """A glTF or PLY file's: which corners are smooth together, not where they point now."""
     colors: UInt8[np.ndarray, "rows 4"] | None = None
     parts: tuple[str, ...] = ("mesh",)
     face_part: Int[np.ndarray, " faces"] | None = None
@@ -39,10 +41,20 @@ class Carrier:
     """-1 where a face has none."""
     mtl: str = ""
     """An OBJ file's material library, so that saving as OBJ loses none of its lines."""
+    labels: dict[str, tuple[tuple[str, ...], np.ndarray]] = field(default_factory=dict)
+    """What an OBJ file's lines ``g`` and ``s`` say: the texts, and each face's number among them,
+    -1 before the first."""
+    objects: bool = True
+    """Whether an OBJ file has lines ``o``; otherwise its parts are its groups."""
+    shades: Float[np.ndarray, "rows 3"] | None = None
+    """An OBJ file's colours as they came, NaN where a vertex has none."""
     textures: dict[str, bytes] = field(default_factory=dict)
     """The image files by the names that ``mtl`` uses."""
-    scene: Any = None
-    """A glTF file's ``trimesh.Scene``; its geometries' vertices, in order, are the rows."""
+    face_colors: UInt8[np.ndarray, "faces 4"] | None = None
+    ply: Any = None
+    """A PLY file's `styleexp.meshes.ply_meshes.Table`."""
+    document: Any = None
+    """A glTF file's `styleexp.meshes.gltf.Document`."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import trimesh
 
 from styleexp import images
 from styleexp.errors import UserError
-from styleexp.meshes import references
+from styleexp.meshes import precision, references
 from styleexp.meshes.mesh import Carrier
 from styleexp.meshes.welding import check_indices, plural
 
@@ -26,6 +26,8 @@ MAP = re.compile(
     re.IGNORECASE | re.MULTILINE,
 )
 
+OTHERS = ("l", "p", "curv", "curv2", "surf", "parm", "trim", "hole", "sp", "con")
+
 
 def read_obj(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
     """The rows' positions, all else, and notes."""
@@ -33,6 +35,10 @@ def read_obj(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
     polygons: list[list[int]] = []  # v and vt of each corner in turn
     polygon_part, polygon_material = [], []
     parts: dict[str, int] = {}
+    labels: dict[str, dict[str, int]] = {"g": {}, "s": {}}
+    label, polygon_label = {"g": -1, "s": -1}, {"g": list[int](), "s": list[int]()}
+    objects = False
+    ignored: dict[str, int] = {}
     materials: dict[str, int] = {}
     libraries: list[str] = []
     part, material = path.stem, -1
@@ -56,8 +62,15 @@ def read_obj(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
             polygons.append(polygon)
             polygon_part.append(parts.setdefault(part, len(parts)))
             polygon_material.append(material)
-        elif key in ("o", "g"):
+            for word, current in label.items():
+                polygon_label[word].append(current)
+        elif key == "o":
+            objects = True
             part = rest or path.stem
+        elif key in labels:
+            label[key] = labels[key].setdefault(rest, len(labels[key]))
+        elif key in OTHERS:
+            ignored[key] = ignored.get(key, 0) + 1
         elif key == "usemtl":
             material = materials.setdefault(rest, len(materials))
         elif key == "mtllib":
@@ -66,7 +79,11 @@ def read_obj(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
     notes: list[str] = []
     if polygons and not data.rstrip(b" \t\0").endswith((b"\n", b"\r")):
         notes.append("its last line has no end: if the file was cut off, faces are missing")
-    positions, colors = _vertices(tables["v"])
+    if ignored:
+        lines = plural(sum(ignored.values()), "line", "lines")
+        notes.append(f"left out {lines} of points, lines and curves ({', '.join(ignored)})")
+    positions, shades = _vertices(tables["v"])
+    colors = None if shades is None else _bytes(shades)
     counts = np.array([len(polygon) // 2 for polygon in polygons], dtype=np.int64)
     index = np.array([i for polygon in polygons for i in polygon], dtype=np.int64).reshape(-1, 2)
     check_indices(index[:, 0], len(positions))
@@ -77,6 +94,16 @@ def read_obj(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
         notes.append("left out the texture coordinates: faces refer to some that do not exist")
         index[:, 1] = -1
 
+    chosen = {
+        word: (tuple(names), np.array(polygon_label[word], dtype=np.int64)[owner])
+        for word, names in labels.items()
+        if names
+    }
+    part_names, face_part = tuple(parts), np.array(polygon_part, dtype=np.int64)[owner]
+    if "g" in chosen and not objects:
+        groups, group = chosen["g"]
+        part_names = (*groups, path.stem)
+        face_part = np.where(group < 0, len(groups), group)
     # A row is one combination of position and texture coordinate.
     rows, inverse = np.unique(index[corner.ravel()], axis=0, return_inverse=True)
     unused = len(positions) - len(np.unique(rows[:, 0]))
@@ -87,10 +114,14 @@ def read_obj(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
         inverse.reshape(-1, 3),
         rows[:, 0],
         np.zeros(len(corner), dtype=bool),
+        precision=precision.of_text([word for line in tables["v"] for word in line[:3]], positions),
         uv=_uv(tables["vt"], rows[:, 1]),
         colors=None if colors is None else colors[rows[:, 0]],
-        parts=tuple(parts) or (path.stem,),
-        face_part=np.array(polygon_part, dtype=np.int64)[owner],
+        shades=None if shades is None else shades[rows[:, 0]],
+        labels=chosen,
+        objects=objects,
+        parts=part_names or (path.stem,),
+        face_part=face_part,
         materials=tuple(known.get(name) or surface(name) for name in materials),
         face_material=np.array(polygon_material, dtype=np.int64)[owner],
         mtl=mtl,
@@ -160,27 +191,33 @@ def _text(data: bytes) -> str:
 
 
 def _vertices(lines: list[list[str]]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Positions (n, 3), and 8-bit colours (n, 4) where every line gives ``x y z r g b``."""
-    shortest = min(map(len, lines), default=3)
-    if shortest < 3:
+    """Positions (n, 3), and colours (n, 3) as they came, NaN where a line has none.
+
+    Lines are ``x y z``, ``x y z w``, ``x y z r g b`` or ``x y z w r g b``; w is not used.
+    """
+    if min(map(len, lines), default=3) < 3:
         raise UserError("has a vertex with fewer than three coordinates: export it again.")
-    width = 6 if shortest >= 6 else 3
-    try:
-        table = np.array([line[:width] for line in lines], dtype=np.float64)
-    except ValueError:
-        number, word = next(
-            (k, word) for k, row in enumerate(lines, 1) for word in row[:width] if not _number(word)
-        )
-        raise UserError(
-            f"has '{word[:20]}' where vertex {number} should have a number: export it again, with "
-            "decimal points."
-        ) from None
-    table = table.reshape(len(lines), -1) if lines else np.zeros((0, 3))
+    table = np.full((len(lines), 6), np.nan)
+    for number, line in enumerate(lines):
+        color = line[4:7] if len(line) >= 7 else line[3:6]
+        words = [*line[:3], *color] if len(color) == 3 else line[:3]
+        try:
+            table[number, : len(words)] = list(map(float, words))
+        except ValueError:
+            wrong = next(word for word in words if not _number(word))
+            raise UserError(
+                f"has '{wrong[:20]}' where vertex {number + 1} should have a number: export it "
+                "again, with decimal points."
+            ) from None
     colors = table[:, 3:]
-    if not colors.size:
-        return table, None
-    bytes_ = np.clip(colors * (1.0 if colors.max() > 1.0 else 255.0), 0, 255).round()
-    return table[:, :3], np.insert(bytes_, 3, 255, axis=1).astype(np.uint8)
+    return table[:, :3].copy(), None if np.isnan(colors).all() else colors.copy()
+
+
+def _bytes(shades: np.ndarray) -> np.ndarray:
+    """8-bit colours (n, 4) of floats up to 1 or numbers up to 255; white where there are none."""
+    top = 1.0 if np.nanmax(shades) > 1.0 else 255.0
+    values = np.clip(np.where(np.isnan(shades), 255.0, shades * top), 0, 255).round()
+    return np.insert(values, 3, 255, axis=1).astype(np.uint8)
 
 
 def _number(word: str) -> bool:

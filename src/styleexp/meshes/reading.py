@@ -1,4 +1,4 @@
-"""Files to meshes: trimesh reads, and one sentence says what is wrong."""
+"""Files to meshes, and one sentence on what is wrong with one; STL and OFF by trimesh."""
 
 from __future__ import annotations
 
@@ -12,30 +12,28 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from styleexp import images
 from styleexp.errors import UserError
-from styleexp.meshes import whole
+from styleexp.meshes import precision, welding, whole
+from styleexp.meshes.gltf import read_gltf
 from styleexp.meshes.mesh import Carrier, Mesh
-from styleexp.meshes.obj import read_obj, surface
+from styleexp.meshes.obj import read_obj
+from styleexp.meshes.ply_meshes import read_ply
 from styleexp.meshes.references import Beside
-from styleexp.meshes.welding import check_indices, plural, weld
+from styleexp.meshes.welding import check_indices, plural
 
-TEXTURES = (
-    "baseColorTexture",
-    "emissiveTexture",
-    "metallicRoughnessTexture",
-    "normalTexture",
-    "occlusionTexture",
-)
-"""Where trimesh's ``PBRMaterial`` has pictures."""
+READERS = {".obj": read_obj, ".ply": read_ply, ".glb": read_gltf, ".gltf": read_gltf}
 READABLE = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
 
 
-def load_mesh(path: str | os.PathLike[str]) -> Mesh:
+def load_mesh(path: str | os.PathLike[str], weld: float | None = None) -> Mesh:
     """Load an OBJ, PLY, STL, OFF, GLB or glTF file as one welded triangle mesh.
 
-    Faces keep the file's order, quads and n-gons triangulated in place (but a PLY or OFF file that
-    mixes them gives its triangles first). Vertices at one position become one; vertices that no
+    ``weld`` is the distance in the file's units within which vertices along open edges are one; 0
+    joins only those at the same position. By default it is what the file's numbers can't tell
+    apart: a few units in the last place of single precision, or of the digits written.
+
+    Faces keep the file's order, quads and n-gons triangulated in place (but an OFF file that
+    mixes them gives its triangles first). Vertices that no
     face uses are left out. All geometries of a glTF scene are joined in world space. Parts whose
     faces point inwards, or disagree among themselves, are turned for the optimisation and saved
     with the file's own winding. Open, non-manifold and multi-component meshes are accepted,
@@ -64,8 +62,9 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
     try:
         # Junk may hold numbers that overflow on the way; `weld` speaks about them.
         with np.errstate(all="ignore"):
-            points, carrier, notes = (read_obj if kind == ".obj" else _read)(data, path)
-        return weld(path.stem, points, carrier, notes)
+            read = READERS.get(kind, _read)
+            points, carrier, notes = read(data, path)
+        return welding.weld(path.stem, points, carrier, notes, weld)
     except UserError as error:
         raise UserError(f"'{path}' {error}") from None
     except MemoryError:
@@ -74,10 +73,9 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
         ) from None
     except Exception as error:
         detail = " ".join(str(error).split())[:120]
-        remedy = "as OBJ, or with triangles only" if kind == ".ply" else "with all files it needs"
         raise UserError(
             f"'{path}' is not a readable {kind[1:].upper()} file "
-            f"({type(error).__name__}: {detail}): export the mesh again, {remedy}."
+            f"({type(error).__name__}: {detail}): export the mesh again, with all files it needs."
         ) from None
 
 
@@ -88,9 +86,6 @@ def _read(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
     resolver = Beside(path)
     scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
     notes: list[str] = []
-    gltf = kind in ("glb", "gltf")
-    if gltf:
-        _check_textures(scene, whole.gltf_header(kind, data), resolver, notes)
     nodes = _own_geometries(scene)
     if len(nodes) < len(scene.graph.nodes_geometry):
         notes.append("left out what has no faces")
@@ -107,9 +102,12 @@ def _read(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
         matrix, name = scene.graph[node]
         shape = scene.geometry[name]
         check_indices(shape.faces, len(shape.vertices))
-        if len(shape.faces) < _declared_faces(kind, data, shape):
+        declared = _declared_faces(kind, data)
+        if len(shape.faces) < declared:
             raise UserError("ends too early: export the mesh again.")
-        if kind in ("ply", "off"):
+        if 0 < declared < len(shape.faces):
+            notes.append("triangulated quads or larger polygons")
+        if kind == "off":
             shape.faces = _in_file_order(np.asarray(shape.faces))
         unused += len(shape.vertices)
         shape.remove_unreferenced_vertices()
@@ -117,18 +115,14 @@ def _read(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
 
         # The specification: a mirrored node winds the other way.
         faces = shape.faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else shape.faces
-        part = node if gltf or len(nodes) > 1 else path.stem
-        if shape.metadata.get("from_gltf_primitive"):
-            part = scene.graph.transforms.parents[node]
+        part = node if len(nodes) > 1 else path.stem
         number, material = -1, _material(shape.visual)
         if material is not None:
             number, _ = materials.setdefault(hash(material), (len(materials), material))
-        normals = shape.vertex_normals @ np.linalg.pinv(matrix[:3, :3]) if gltf else None
         for column, values in (
             ("points", trimesh.transform_points(shape.vertices, matrix)),
             ("corners", faces + sum(lengths)),
             ("uv", getattr(shape.visual, "uv", None)),
-            ("normals", normals),
             ("colors", _colors(shape.visual)),
             ("part", np.full(len(faces), parts.setdefault(part, len(parts)))),
             ("material", np.full(len(faces), number)),
@@ -139,60 +133,33 @@ def _read(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
     if unused:
         notes.append(f"left out {plural(unused, 'vertex', 'vertices')} that no face uses")
     corners = np.concatenate(columns["corners"])
+    positions = np.concatenate(columns["points"])
     carrier = Carrier(
         corners,
         np.zeros(sum(lengths), dtype=np.int64),
         np.zeros(len(corners), dtype=bool),
+        precision=_precision(kind, data, positions),
         uv=_joined(columns["uv"], lengths[1:], np.zeros(2)),
-        normals=_joined(columns["normals"], lengths[1:], np.zeros(3)),
         colors=_joined(columns["colors"], lengths[1:], np.full(4, 255, dtype=np.uint8)),
         parts=tuple(parts),
         face_part=np.concatenate(columns["part"]),
         materials=tuple(material for _, material in materials.values()),
         face_material=np.concatenate(columns["material"]),
-        scene=scene if gltf else None,
     )
-    return np.concatenate(columns["points"]), carrier, notes
+    return positions, carrier, notes
 
 
-def _declared_faces(kind: str, data: bytes, shape: trimesh.Trimesh) -> int:
-    """How many a PLY or OFF file promises: trimesh takes what there is of a file cut off."""
-    if kind == "ply":
-        return shape.metadata["_ply_raw"]["face"]["length"]
+def _precision(kind: str, data: bytes, points: np.ndarray) -> float:
+    if kind == "stl" and (b"\0" in data[:1000] or b"facet" not in data[:1000]):
+        return precision.of_floats(points)
+    words = data[: 1 << 22].replace(b"\r", b"\n").split()
+    return precision.of_text(words, points)
+
+
+def _declared_faces(kind: str, data: bytes) -> int:
+    """How many an OFF file promises: trimesh takes what there is of a file cut off."""
     counts = re.search(rb"^(?:OFF)?[ \t]*\d+[ \t]+(\d+)", data, re.MULTILINE)
     return int(counts[1]) if kind == "off" and counts else 0
-
-
-def _check_textures(
-    scene: trimesh.Scene, header: dict[str, Any], resolver: Beside, notes: list[str]
-) -> None:
-    """Take out textures that can't be decoded: trimesh would find out when the result is saved."""
-    absent = 0
-    for image in header.get("images", ()):
-        uri = image.get("uri", "")
-        if uri and "base64," not in uri:
-            try:
-                resolver.get(uri)
-            except UserError as error:
-                absent += 1
-                notes.append(f"saved without a texture: the file {str(error).split(':')[0]}")
-    faults: dict[int, str] = {}
-    for shape in scene.geometry.values():
-        material = getattr(getattr(shape, "visual", None), "material", None)
-        for slot in TEXTURES if material is not None else ():
-            image = getattr(material, slot, None)
-            if image is None:
-                continue
-            if id(image) not in faults:
-                faults[id(image)] = images.fault_of(image)
-                if faults[id(image)]:
-                    notes.append(f"saved without a texture ({slot}): it {faults[id(image)]}")
-            if faults[id(image)]:
-                setattr(material, slot, None)
-    lost = len(header.get("images", ())) - absent - len(faults)
-    if lost > 0:
-        number = plural(lost, "texture", "textures")
-        notes.append(f"saved without {number} that no material uses or that can't be decoded")
 
 
 def _own_geometries(scene: trimesh.Scene) -> list[str]:
@@ -234,8 +201,6 @@ def _colors(visual: Any) -> np.ndarray | None:
 
 def _material(visual: Any) -> Any:
     material = getattr(visual, "material", None)
-    if isinstance(material, trimesh.visual.material.SimpleMaterial):  # what a PLY file has
-        return surface("material", material.image) if material.image else None
     return material
 
 

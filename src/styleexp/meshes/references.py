@@ -6,6 +6,8 @@ A mesh may come from anywhere, so only files in or below its own folder are read
 
 from __future__ import annotations
 
+import base64
+import binascii
 import re
 from pathlib import Path
 from urllib.parse import unquote
@@ -70,3 +72,16 @@ class Beside(Resolver):
     def namespaced(self, namespace: str) -> Beside:
         """The same place: folders of archives are not read."""
         return self
+
+
+def resolved(uri: str, beside: Beside) -> bytes:
+    """What a URI stands for: data in itself, or a file in the mesh's folder."""
+    if not uri.startswith("data:"):
+        return beside.get(uri)
+    head, _, body = uri.partition(",")
+    try:
+        if not head.endswith(";base64"):
+            raise ValueError
+        return base64.b64decode(body, validate=True)
+    except (ValueError, binascii.Error):
+        raise UserError("has a data URI that cannot be decoded: export the mesh again.") from None

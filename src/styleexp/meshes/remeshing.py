@@ -10,6 +10,7 @@ import trimesh
 
 from styleexp.errors import UserError
 from styleexp.meshes.mesh import Mesh, face_areas, normalisation
+from styleexp.meshes.welding import torn
 
 
 def remesh(mesh: Mesh, target_vertices: int) -> Mesh:
@@ -30,6 +31,8 @@ def remesh(mesh: Mesh, target_vertices: int) -> Mesh:
     result = None if reason else _botsch(points, mesh.faces, target_vertices)
     if result is None:
         reason = reason or "the remesher failed"
+        if "manifold" in reason and (told := torn(mesh.vertices, mesh.faces)):
+            reason += f"; {told}"
         vertices, faces, times = points, mesh.faces, 0
         while len(vertices) < target_vertices:
             vertices, faces = trimesh.remesh.subdivide(vertices, faces)

@@ -8,11 +8,14 @@ import numpy as np
 import trimesh
 
 from styleexp.errors import UserError
+from styleexp.meshes import joining
 from styleexp.meshes.mesh import Carrier, Mesh, face_areas
 
-# Points nearer to each other than this share of the extent are one vertex. It forgives the rounding
-# of a node's transform (1e-16), and is far below what float32 files can tell apart (6e-8).
-_WELD = 1e-9
+LEAST = 1e-9
+"""Of the extent: what is nearer is the same even in a file of doubles, whose coordinates a node's
+transform or an exporter has rounded on the way."""
+GAP = 1e-4
+"""Of the extent: open edges that lie nearer to each other were hardly meant to be open."""
 
 
 def plural(count: int, one: str, many: str) -> str:
@@ -30,8 +33,17 @@ def check_indices(corners: np.ndarray, count: int) -> None:
         )
 
 
-def weld(name: str, points: np.ndarray, carrier: Carrier, notes: list[str]) -> Mesh:
+def weld(
+    name: str,
+    points: np.ndarray,
+    carrier: Carrier,
+    notes: list[str],
+    distance: float | None = None,
+) -> Mesh:
     """One vertex per position of the rows at ``points`` (rows, 3); ``carrier.rows`` is filled in.
+
+    Rows at the same position are one vertex; along open edges those within ``distance``, too, in
+    the file's units, by default what its numbers can't tell apart (`joining.near`).
 
     Raises `UserError` with the end of a sentence that begins with the file's name.
     """
@@ -54,11 +66,19 @@ def weld(name: str, points: np.ndarray, carrier: Carrier, notes: list[str]) -> M
         notes.append("lies far from the origin, where PLY and GLB round coordinates; OBJ does not")
 
     # First appearance gives a vertex its place and position, so an order without duplicates stays.
-    grid = np.round((points - points.min(axis=0)) / (extent * _WELD)).astype(np.int64)
-    _, first, inverse = np.unique(grid, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    vertices, rows = points[first[order]], np.argsort(order)[inverse.ravel()]
+    first, rows = joining.exact(points)
+    reach = max(LEAST * extent, carrier.precision) if distance is None else distance
+    owner = joining.near(points[first], rows[carrier.corners], reach)
+    joined = int((owner != np.arange(len(owner))).sum())
+    if joined:
+        kept, place = np.unique(owner, return_inverse=True)
+        first, rows = first[kept], place[rows]
+        number = plural(joined, "vertex", "vertices")
+        notes.append(f"joined {number} within {reach:.2g} of others along open edges")
+    vertices = points[first]
     file_faces = rows[carrier.corners]
+    if told := torn(vertices, file_faces):
+        notes.append(told)
 
     unit = (vertices - vertices.mean(axis=0)) / extent
     degenerate = int((face_areas(unit, file_faces) <= 1e-20).sum())
@@ -71,9 +91,24 @@ def weld(name: str, points: np.ndarray, carrier: Carrier, notes: list[str]) -> M
     faces = np.where(flipped[:, None], file_faces[:, ::-1], file_faces)
 
     carrier = replace(carrier, rows=rows, flipped=flipped)
-    if carrier.uv is None and carrier.normals is None and carrier.colors is None:
+    columns = (carrier.uv, carrier.normals, carrier.colors, carrier.ply, carrier.document)
+    if all(column is None for column in columns):
         carrier = replace(carrier, corners=file_faces, rows=np.arange(len(vertices)))
     return Mesh(name, vertices, np.ascontiguousarray(faces), tuple(notes), carrier)
+
+
+def torn(vertices: np.ndarray, faces: np.ndarray) -> str:
+    """One sentence on open edges that nearly coincide, empty where there are none."""
+    extent = float(np.ptp(vertices, axis=0).max())
+    count, gap = joining.nearly_closed(vertices, faces, GAP * extent)
+    if not count:
+        return ""
+    unit = 10.0 ** (np.floor(np.log10(gap)) - 1) if gap > 0 else 1.0
+    wide = np.ceil(gap * 1.01 / unit) * unit  # two digits, rounded up
+    return (
+        f"{plural(count, 'open edge nearly coincides', 'open edges nearly coincide')} with others, "
+        f"up to {gap:.2g} apart: source.weld={wide:g} joins them"
+    )
 
 
 def _inside_out(points: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.ndarray:

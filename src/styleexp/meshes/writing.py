@@ -5,23 +5,22 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import trimesh
 
 from styleexp import atomic
 from styleexp.errors import UserError
+from styleexp.meshes.gltf_making import new_glb
+from styleexp.meshes.gltf_writing import glb_of
 from styleexp.meshes.mesh import Carrier, Mesh, vertex_normals
-from styleexp.meshes.obj import MAP, surface
+from styleexp.meshes.obj import MAP
+from styleexp.meshes.ply_meshes import ply_of
 from styleexp.meshes.references import bare
 
 if TYPE_CHECKING:
     from jaxtyping import Float
-
-
-DISPLACEMENT = "_DISPLACEMENT"
-"""glTF wants custom attributes to begin with an underscore, and to be in capitals."""
 
 
 def save_mesh(
@@ -36,15 +35,17 @@ def save_mesh(
     coordinates with their seams, materials and images, colours, part names, winding. A GLB gets
     normals, computed anew, with the hard edges of a glTF input.
 
-    - PLY: one object without textures; ``displacement`` is its float vertex property.
+    - PLY: one object without textures; ``displacement`` is its float vertex property. A PLY file's
+      own properties come back, in its types.
     - OBJ: faces and materials in the file's order. Materials and images are written beside it,
       named after it: ``out.obj``, ``out.mtl``, ``out_wood.png``.
-    - GLB: a glTF file's scene as trimesh knows it; otherwise a node for each part. ``displacement``
-      is the custom attribute ``_DISPLACEMENT``, in the mesh's own units whatever the nodes' scale.
+    - GLB: a glTF file's own document, with new positions, their normals (where it has some) and
+      without their tangents; otherwise a node for each part. ``displacement`` is the custom
+      attribute ``_DISPLACEMENT``, in the mesh's own units whatever the nodes' scale.
 
-    PLY and GLB hold single precision. Every file is replaced in one step, so an interrupted run
-    leaves no half of one. Raises `UserError` if the place cannot be written, the extension is
-    unknown or values are not finite.
+    PLY and GLB hold single precision, but a PLY whose source has doubles holds doubles. Every file
+    is replaced in one step, so an interrupted run leaves no half of one. Raises `UserError` if the
+    place cannot be written, the extension is unknown or values are not finite.
     """
     path = Path(path)
     kind = path.suffix.lower()
@@ -68,14 +69,20 @@ def save_mesh(
         mesh.faces, np.arange(len(vertices)), np.zeros(len(mesh.faces), bool), parts=(mesh.name,)
     )
     if kind == ".ply":
-        files = {path.name: _ply(carrier, vertices, displacement)}
+        files = {path.name: _ply(carrier, mesh, vertices, displacement)}
     elif kind == ".obj":
-        files = _obj(carrier, vertices, path)
+        files = _obj(carrier, mesh, vertices, path)
     else:
-        make = _moved_scene if carrier.scene is not None else _new_scene
         values = None if displacement is None else np.asarray(displacement, np.float32)
-        scene = make(carrier, vertices, _row_normals(carrier, vertices), values)
-        files = {path.name: scene.export(file_type="glb", include_normals=True)}
+        normals = _row_normals(carrier, vertices)
+        rows = carrier.rows
+        values = None if values is None else values[rows]
+        if carrier.document is not None:
+            moved = (vertices != mesh.vertices).any(axis=1)[rows]
+            content = glb_of(carrier, vertices[rows], moved, normals, values)
+        else:
+            content = new_glb(carrier, list(_runs(carrier)), vertices[rows], normals, values)
+        files = {path.name: content}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():  # the mesh comes last, when all it needs is there
@@ -103,113 +110,46 @@ def _distinct(*columns: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
 
 def ply_rows(carrier: Carrier) -> tuple[np.ndarray, np.ndarray]:
     """The rows that a PLY file gets, in its order, and which of them each row became."""
+    if carrier.ply is not None and carrier.ply.rows:
+        return np.arange(len(carrier.rows)), np.arange(len(carrier.rows))
     return _distinct(carrier.rows, carrier.uv, carrier.colors)
 
 
-def _runs(carrier: Carrier) -> Iterator[tuple[int, int, np.ndarray]]:
-    """Part, material (-1 for none) and faces, wherever one of the two changes."""
+def _runs(carrier: Carrier, *more: np.ndarray) -> Iterator[tuple[int, int, np.ndarray]]:
+    """Part, material (-1 for none) and faces, wherever one of them (or of ``more``) changes."""
     n = len(carrier.corners)
     part = np.zeros(n, dtype=np.int64) if carrier.face_part is None else carrier.face_part
     material = np.full(n, -1) if carrier.face_material is None else carrier.face_material
-    turns = np.flatnonzero((np.diff(part) != 0) | (np.diff(material) != 0)) + 1
+    changes = [np.diff(column) != 0 for column in (part, material, *more)]
+    turns = np.flatnonzero(np.logical_or.reduce(changes)) + 1
     for run in np.split(np.arange(n), turns):
         yield int(part[run[0]]), int(material[run[0]]), run
 
 
-def _ply(carrier: Carrier, vertices: np.ndarray, displacement: np.ndarray | None) -> bytes:
+def _ply(
+    carrier: Carrier, mesh: Mesh, vertices: np.ndarray, displacement: np.ndarray | None
+) -> bytes:
     first, combined = ply_rows(carrier)
     rows = carrier.rows[first]
-    colors = None if carrier.colors is None else carrier.colors[first]
-    faces = combined[carrier.corners]
-    mesh = trimesh.Trimesh(vertices[rows], faces, vertex_colors=colors, process=False)
-    if carrier.uv is not None:
-        for k, name in enumerate("st"):
-            mesh.vertex_attributes[name] = carrier.uv[first, k].astype(np.float32)
-    if displacement is not None:
-        mesh.vertex_attributes["displacement"] = np.asarray(displacement, np.float32)[rows]
-    return mesh.export(file_type="ply", vertex_normal=False)
-
-
-# --------------------------------------------------------------------------------------------- GLB
-
-
-def _moved_scene(
-    carrier: Carrier, vertices: np.ndarray, normals: np.ndarray, displacement: np.ndarray | None
-) -> trimesh.Scene:
-    """The input's scene with new positions and normals, each in its node's frame."""
-    scene = carrier.scene.copy()
-    node_of = {scene.graph[node][1]: node for node in scene.graph.nodes_geometry}
-    start = 0
-    for name, shape in scene.geometry.items():
-        if not len(getattr(shape, "faces", ())):
-            continue
-        matrix, _ = scene.graph[node_of[name]]
-        rows = slice(start, start + len(shape.vertices))
-        start = rows.stop
-        moved = trimesh.transform_points(vertices[carrier.rows[rows]], np.linalg.pinv(matrix))
-        shape.vertices = moved
-        shape.vertex_normals = normals[rows] @ matrix[:3, :3]
-        _attach(shape, displacement, carrier.rows[rows])
-    return scene
-
-
-def _attach(shape: trimesh.Trimesh, displacement: np.ndarray | None, rows: np.ndarray) -> None:
-    shape.vertex_attributes.pop(DISPLACEMENT, None)  # of an input that is itself a result
-    if displacement is not None:
-        shape.vertex_attributes[DISPLACEMENT] = displacement[rows]
-
-
-def _new_scene(
-    carrier: Carrier, vertices: np.ndarray, normals: np.ndarray, displacement: np.ndarray | None
-) -> trimesh.Scene:
-    """A node for each part; if it has several materials, with a child for each."""
-    pieces: dict[int, dict[int, list[np.ndarray]]] = {}
-    for part, material, run in _runs(carrier):
-        pieces.setdefault(part, {}).setdefault(material, []).append(run)
-    scene = trimesh.Scene()
-    names = {scene.graph.base_frame}
-    for part, by_material in pieces.items():
-        label = trimesh.util.unique_name(carrier.parts[part], names)
-        names.add(label)
-        if len(by_material) > 1:
-            scene.graph.update(label)
-        for material, runs in by_material.items():
-            rows, faces = np.unique(carrier.corners[np.concatenate(runs)], return_inverse=True)
-            shape = trimesh.Trimesh(
-                vertices[carrier.rows[rows]],
-                faces.reshape(-1, 3),
-                vertex_normals=normals[rows],
-                visual=_visual(carrier, material, rows),
-                process=False,
-            )
-            _attach(shape, displacement, carrier.rows[rows])
-            node, parent = label, None
-            if len(by_material) > 1:
-                # trimesh's own mark of such a child; `load_mesh` calls it by its parent's name.
-                shape.metadata["from_gltf_primitive"] = True
-                surface_name = carrier.materials[material].name if material >= 0 else "plain"
-                node, parent = trimesh.util.unique_name(f"{label} {surface_name}", names), label
-                names.add(node)
-            scene.add_geometry(shape, node_name=node, geom_name=node, parent_node_name=parent)
-    return scene
-
-
-def _visual(carrier: Carrier, material: int, rows: np.ndarray) -> Any:
-    uv = None if carrier.uv is None else carrier.uv[rows]
-    colors = None if carrier.colors is None else carrier.colors[rows]
-    if material < 0 and uv is None:
-        return trimesh.visual.ColorVisuals(vertex_colors=colors)
-    chosen = carrier.materials[material] if material >= 0 else surface("plain")
-    visual = trimesh.visual.TextureVisuals(uv=uv, material=chosen)
-    if colors is not None:
-        visual.vertex_attributes["color"] = colors
-    return visual
+    points, normals = vertices[rows], None
+    if carrier.ply is not None:
+        moved = (vertices != mesh.vertices).any(axis=1)
+        own = np.stack([carrier.ply.vertex[name] for name in "xyz"], axis=1)[first]
+        # Rows that were welded and did not move are where they were, to the last bit.
+        points = np.where(moved[rows][:, None], points, own)
+        if carrier.normals is not None:
+            near = np.zeros(len(vertices), dtype=bool)
+            near[mesh.faces[moved[mesh.faces].any(axis=1)]] = True
+            new = _row_normals(carrier, vertices)[first]
+            normals = np.where(near[rows][:, None], new, carrier.normals[first])
+    values = None if displacement is None else np.asarray(displacement)[rows]
+    return ply_of(carrier, first, combined[carrier.corners], points, normals, values)
 
 
 # --------------------------------------------------------------------------------------------- OBJ
 
 
-def _obj(carrier: Carrier, vertices: np.ndarray, path: Path) -> dict[str, bytes]:
+def _obj(carrier: Carrier, mesh: Mesh, vertices: np.ndarray, path: Path) -> dict[str, bytes]:
     files: dict[str, bytes] = {}
     out = ["# written by styleexp"]
     names: list[str] = []
@@ -230,34 +170,51 @@ def _obj(carrier: Carrier, vertices: np.ndarray, path: Path) -> dict[str, bytes]
 
     # The whole mesh's vertices in their order, unless colours have seams.
     index, table = carrier.rows, vertices
-    if carrier.colors is not None:
+    moved = (vertices != mesh.vertices).any(axis=1)
+    if carrier.shades is not None:
+        first, index = _distinct(carrier.rows, np.nan_to_num(carrier.shades, nan=-1.0))
+        moved = moved[carrier.rows[first]]
+        table = np.column_stack([vertices[carrier.rows[first]], carrier.shades[first]])
+    elif carrier.colors is not None:
         first, index = _distinct(carrier.rows, carrier.colors)
         colors = carrier.colors[first, :3] / 255.0
+        moved = moved[carrier.rows[first]]
         table = np.column_stack([vertices[carrier.rows[first]], colors])
-    out += _lines("v", table, 12)
+    out += [
+        _line("v", row, 12 if new else 17) for row, new in zip(table.tolist(), moved, strict=True)
+    ]
     words = [index + 1]
     if carrier.uv is not None:
         first, index = _distinct(carrier.uv)
-        out += _lines("vt", carrier.uv[first], 9)
+        out += [_line("vt", row, 17) for row in carrier.uv[first].tolist()]
         words.append(index + 1)
     corner = ["/".join(map(str, row)) for row in np.stack(words, axis=1).tolist()]
 
-    last_part = last_material = -1
-    for part, chosen, run in _runs(carrier):
-        if part != last_part:
-            out.append(f"o {carrier.parts[part]}")
-        if chosen != last_material and chosen >= 0:
-            out.append(f"usemtl {names[chosen]}")
-        last_part, last_material = part, chosen
+    # What the faces before have is said once.
+    said: dict[str, int] = {}
+    texts = {"o": carrier.parts, "usemtl": tuple(names)} | {
+        word: label for word, (label, _) in carrier.labels.items()
+    }
+    if not carrier.objects:
+        del texts["o"]
+    for part, chosen, run in _runs(carrier, *(which for _, which in carrier.labels.values())):
+        state = {"o": part} | {w: int(which[run[0]]) for w, (_, which) in carrier.labels.items()}
+        for word, number in (state | {"usemtl": chosen}).items():
+            if word in texts and number >= 0 and said.get(word) != number:
+                out.append(f"{word} {texts[word][number]}".rstrip())
+                said[word] = number
         for a, b, c in carrier.corners[run].tolist():
             out.append(f"f {corner[a]} {corner[b]} {corner[c]}")
     files[path.name] = ("\n".join(out) + "\n").encode()
     return files
 
 
-def _lines(word: str, table: np.ndarray, digits: int) -> list[str]:
-    pattern = " ".join([word, *[f"%.{digits}g"] * table.shape[1]])
-    return [pattern % tuple(row) for row in table.tolist()]
+def _line(word: str, numbers: list[float], digits: int) -> str:
+    """The numbers that aren't NaN, with as many digits; with 17 exactly, as shortly as can be."""
+    known = [x for x in numbers if x == x]
+    if digits >= 17:
+        return " ".join([word, *map(repr, known)])
+    return " ".join([word, *(f"{x:.{digits}g}" for x in known)])
 
 
 def _mtl(carrier: Carrier, names: list[str]) -> tuple[str, dict[str, bytes]]:

@@ -153,6 +153,10 @@ def read_result(path: Path, source: meshes.Mesh) -> tuple[np.ndarray, np.ndarray
 
 def _rows(path: Path) -> np.ndarray:
     """Vertices in the order of the file."""
+    if path.suffix.lower() == ".ply":
+        from styleexp.meshes.ply import numbers, parse
+
+        return numbers(parse(path.read_bytes()).elements["vertex"], *"xyz")
     import trimesh
 
     loaded = trimesh.load(path, process=False, force="mesh")

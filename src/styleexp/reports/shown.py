@@ -102,7 +102,7 @@ def read(run: Run) -> Shown:
         try:
             vertices, faces, displacement = read_result(path)
             frame = frame or meshes.normalisation(vertices)
-        except Exception as error:  # trimesh raises almost anything on a damaged file
+        except Exception as error:  # whatever a damaged file does
             missing.append(f"The result can't be shown: result.ply cannot be read ({error}).")
         else:
             found |= {"result": Shape(frame.apply(vertices), faces), "displacement": displacement}
@@ -113,14 +113,9 @@ def read(run: Run) -> Shown:
 
 def read_result(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Vertices (n, 3), faces (m, 3) and displacement (n,) of a ``result.ply``, rows as stored."""
-    import trimesh
+    from styleexp.meshes.ply import stored_result
 
-    mesh = trimesh.load_mesh(path, process=False)
-    stored = mesh.metadata["_ply_raw"]["vertex"]["data"]  # where trimesh keeps custom properties
-    displacement = None
-    if "displacement" in stored.dtype.names:
-        displacement = np.asarray(stored["displacement"], dtype=float).ravel()
-    return np.asarray(mesh.vertices), np.asarray(mesh.faces), displacement
+    return stored_result(path.read_bytes())
 
 
 def read_moved(folder: Path) -> tuple[meshes.Mesh, np.ndarray, np.ndarray]:
@@ -139,13 +134,15 @@ def read_moved(folder: Path) -> tuple[meshes.Mesh, np.ndarray, np.ndarray]:
     if source is None:
         raise UserError(f"'{folder}' can't be used: {missing[0]}")
     try:
-        stored, _, values = read_result(path)
-    except Exception as error:  # trimesh raises almost anything on a damaged file
+        stored, faces, values = read_result(path)
+    except Exception as error:  # whatever a damaged file does
         raise UserError(f"'{path}' cannot be read ({error}): run again.") from None
-    rows = np.arange(len(source.vertices))
+    rows, corners = np.arange(len(source.vertices)), source.faces
     if source.carrier is not None:
-        rows = source.carrier.rows[ply_rows(source.carrier)[0]]
-    if values is None or len(stored) != len(rows):
+        first, combined = ply_rows(source.carrier)
+        rows, corners = source.carrier.rows[first], combined[source.carrier.corners]
+    # As many vertices in another order, as another version wrote them, would be another mesh.
+    if values is None or len(stored) != len(rows) or not np.array_equal(faces, corners):
         raise UserError(
             f"'{path}' has other vertices than its source '{source.name}' (as baseline="
             "geometric_textures makes them, which resamples it), so its displacement is not of "
