@@ -29,6 +29,10 @@ class SourceConfig:
     those at the same position; null what the file's numbers can't tell apart."""
     remesh: int | None = None
     """Remesh to about this many vertices first (attributes are lost); null keeps the mesh."""
+    refine: str = "none"
+    """``auto``: edges too long for the style's relief are halved until none is left, on the smooth
+    surface through the mesh; texture coordinates, materials and colours are kept. ``none``: the
+    mesh's own vertices and faces, as in the paper."""
 
 
 @dataclass
@@ -283,6 +287,7 @@ class Config:
 
 
 CHOICES: dict[str, tuple[Any, ...]] = {
+    "source.refine": ("none", "auto"),
     "style.scale_by": ("area", "frame"),
     "views.spread": ("normal", "around"),
     "field.start": ("map", "source"),

@@ -46,6 +46,10 @@ PICTURE_DETAIL = 128
 """Pixels on a picture's longer side when its frequency is measured; finer detail doesn't count."""
 
 
+PER_WAVE = 6.0
+"""Of the longest edges, on a wavelength of the style's relief, where the source is refined."""
+MOST_REFINED = 400_000
+"""Faces that refining aims at, at most."""
 STRAY = 5.0
 """A mesh has stray faces where a vertex is so many times farther off than 99 of 100 vertices."""
 
@@ -93,10 +97,12 @@ def load(config: Config) -> Subject:
     source = load_source(config.source)
     style = load_style(config.style)
     doing(f"measuring the source ({len(source.faces):,} faces) and the style")
-    frame, surface = normalised(source, device)
     unit = pattern_unit(config.style, source, style if isinstance(style, meshes.Mesh) else None)
     sigma, bound, height = choose_field(config.field, style)
     size = 1.0 if config.style.scale_by == "frame" else unit
+    if config.source.refine == "auto":
+        source = refined(source, size / sigma)
+    frame, surface = normalised(source, device)
     return Subject(
         config=config,
         source=source,
@@ -225,16 +231,27 @@ def choose_field(
     return sigma, bound, height
 
 
+def refined(mesh: meshes.Mesh, wavelength: float) -> meshes.Mesh:
+    """The mesh with edges short enough for a relief of this wavelength, in radii; fewer than that
+    needs where it would take more than `MOST_REFINED` faces."""
+    scale = meshes.normalisation(mesh.vertices).scale
+    area = meshes.face_areas(mesh.vertices, mesh.faces).sum()
+    # Halving leaves edges between half of the longest and that: about 0.75 of it on average.
+    affordable = math.sqrt(area / (MOST_REFINED * math.sqrt(3) / 4)) / 0.75
+    longest = max(wavelength / PER_WAVE * scale, affordable)
+    doing("refining the source for the style")
+    return meshes.refine(mesh, longest)
+
+
 def too_coarse(mesh: meshes.Mesh, wavelength: float) -> list[str]:
     """A note where the mesh's edges can't carry details of this size, in radii."""
     edge = meshes.mean_edge_length(mesh.vertices, mesh.faces)
     edge /= meshes.normalisation(mesh.vertices).scale
     if edge <= wavelength / 4:
         return []
-    enough = int(len(mesh.vertices) * (4 * edge / wavelength) ** 2)
     return [
         f"'{mesh.name}' is coarse for this style: its edges are {edge:.3f} radii long, the style's "
-        f"details about {wavelength:.3f}; source.remesh={round(enough, -3)} would carry them."
+        f"details about {wavelength:.3f}; add source.refine=auto, which keeps texture coordinates."
     ]
 
 

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from styleexp.meshes.memory import from_arrays as from_arrays
     from styleexp.meshes.memory import from_memory as from_memory
     from styleexp.meshes.reading import load_mesh as load_mesh
+    from styleexp.meshes.refining import refine as refine
     from styleexp.meshes.remeshing import remesh as remesh
     from styleexp.meshes.remeshing import resample as resample
     from styleexp.meshes.writing import save_mesh as save_mesh
@@ -49,6 +50,7 @@ _HOMES = {
     "from_arrays": "memory",
     "from_memory": "memory",
     "load_mesh": "reading",
+    "refine": "refining",
     "remesh": "remeshing",
     "resample": "remeshing",
     "save_mesh": "writing",

@@ -9,6 +9,7 @@ import numpy as np
 from styleexp import images
 from styleexp.errors import UserError
 from styleexp.meshes.mesh import Carrier, Mesh
+from styleexp.meshes.precision import of_floats
 from styleexp.meshes.welding import check_indices, weld
 
 if TYPE_CHECKING:
@@ -62,5 +63,6 @@ def from_arrays(
         notes.append(f"left out {len(points) - len(used)} vertices that no face uses")
     corners = places.reshape(corners.shape)
     no_row = np.zeros(len(used), dtype=np.int64)
-    carrier = Carrier(corners, no_row, np.zeros(len(corners), dtype=bool))
+    rounding = of_floats(points) if np.asarray(vertices).dtype == np.float32 else 0.0
+    carrier = Carrier(corners, no_row, np.zeros(len(corners), dtype=bool), precision=rounding)
     return weld("array", points[used], carrier, notes)
