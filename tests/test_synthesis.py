@@ -1,0 +1,218 @@
+"""method=synthesis: walking, directions, patches, and what comes of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+import styleexp
+from styleexp import meshes, shapes
+from styleexp.errors import UserError
+from styleexp.metrics.patches import relief_of_mesh
+from styleexp.synthesis.direction import FLOW, UP, direction_field, turned
+from styleexp.synthesis.exemplar import MeshExemplar, PictureExemplar, measure
+from styleexp.synthesis.optimise import bank, matched
+from styleexp.synthesis.room import ball_radius
+from styleexp.synthesis.shape import exemplar_of
+from styleexp.synthesis.walk import Sheet
+
+CHEAP = ("method=synthesis", "metrics.judge=none", "baseline.bank=2000", "source.refine=none")
+
+
+@pytest.fixture(scope="module")
+def ball():
+    shape = trimesh.creation.icosphere(5)
+    return Sheet(shape.vertices, np.asarray(shape.faces))
+
+
+@pytest.fixture(scope="module")
+def plane():
+    across = np.linspace(-1, 1, 61)
+    x, y = np.meshgrid(across, across)
+    number = np.arange(61 * 61).reshape(61, 61)
+    a, b = number[:-1, :-1].ravel(), number[:-1, 1:].ravel()
+    c, d = number[1:, 1:].ravel(), number[1:, :-1].ravel()
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    return Sheet(np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1), faces)
+
+
+def test_a_walk_over_a_ball_stays_on_it_and_comes_home(ball):
+    start = np.arange(50)
+    up = np.broadcast_to([0.0, 1.0, 0.0], ball.vertices.shape)
+    state = ball.vertices[start], direction_field(ball, up, UP)[start], start
+    steps = 60
+    for _ in range(steps):
+        state = ball.step(*state, (2 * np.pi / steps, 0.0))
+    assert np.abs(np.linalg.norm(state[0], axis=1) - 1).max() < 0.01
+    assert np.linalg.norm(state[0] - ball.vertices[start], axis=1).max() < 0.1  # a great circle
+
+
+def test_a_grid_on_a_plane_is_a_grid(plane):
+    middle = np.array([30 * 61 + 30])
+    points, nears = plane.grids(middle, np.array([[0.0, 1.0, 0.0]]), 5, 0.1)
+    expected = (np.arange(5) - 2) * 0.1
+    assert np.allclose(points[0, :, :, 0], expected[None], atol=1e-12)  # column 0 to the left
+    assert np.allclose(points[0, :, :, 1], -expected[:, None], atol=1e-12)  # row 0 ahead
+    assert plane.on_the_mesh(points, nears).all()
+    beyond, nears = plane.grids(np.array([0]), np.array([[0.0, 1.0, 0.0]]), 9, 0.1)
+    assert not plane.on_the_mesh(beyond, nears).all()
+
+
+def test_interpolation_is_exact_for_what_is_linear(plane):
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-0.95, 0.95, (500, 2)), np.zeros(500)])
+    matrix = plane.interpolation(points, plane.nearest(points))
+    values = 3 * plane.vertices[:, 0] - 2 * plane.vertices[:, 1] + 1
+    assert np.allclose(matrix @ values, 3 * points[:, 0] - 2 * points[:, 1] + 1, atol=1e-5)
+    assert np.allclose(matrix.sum(axis=1), 1, atol=1e-6)
+
+
+def test_the_field_is_tangent_and_holds_up_where_it_can(ball):
+    up = np.broadcast_to([0.0, 1.0, 0.0], ball.vertices.shape)
+    field = direction_field(ball, up, UP)
+    assert np.allclose(np.linalg.norm(field, axis=1), 1)
+    assert np.abs((field * ball.normals).sum(1)).max() < 1e-9
+    level = np.abs(ball.vertices[:, 1]) < 0.7
+    tangent = up - (up * ball.normals).sum(1, keepdims=True) * ball.normals
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True).clip(min=1e-9)
+    assert (field * tangent).sum(1)[level].min() > 0.98
+    across = turned(field, ball.normals, np.pi / 2)
+    assert np.abs((across * field).sum(1)).max() < 1e-9
+
+
+def test_the_flow_does_not_depend_on_how_the_mesh_lies(ball):
+    """With the wish turned along, the field turns along."""
+    rotation = trimesh.transformations.rotation_matrix(1.0, [1, 2, 3])[:3, :3]
+    wish = np.array([0.0, 1.0, 0.0])
+    one = direction_field(ball, np.broadcast_to(wish, ball.vertices.shape), FLOW)
+    turned_ball = Sheet(ball.vertices @ rotation.T, ball.faces)
+    wishes = np.broadcast_to(rotation @ wish, ball.vertices.shape)
+    other = direction_field(turned_ball, wishes, FLOW)
+    # Next to a singularity it is anybody's guess.
+    assert np.quantile((one @ rotation.T * other).sum(1), 0.02) > 0.999
+
+
+@pytest.mark.parametrize(
+    ("style", "shortest", "longest", "directed"),
+    [
+        ("stripe", 0.15, 0.27, True), ("scales", 0.13, 0.3, True),
+        ("wave_small", 0.1, 0.25, False), ("buckyball", 0.4, 0.8, False),
+    ],
+)  # fmt: skip
+def test_wavelength_and_direction_are_measured(style, shortest, longest, directed):
+    from styleexp.synthesis.method import DIRECTED
+
+    relief = relief_of_mesh(shapes.make(style, detail=12_000))
+    found = measure(
+        MeshExemplar(Sheet(relief.base, relief.faces), relief.height), np.random.default_rng(0)
+    )
+    assert shortest < found.wavelength < longest
+    assert (found.directed > DIRECTED) == directed
+
+
+def test_a_pictures_waves_are_measured_in_its_own_size():
+    rows = torch.arange(256) / 256
+    waves = torch.sin(2 * np.pi * 8 * rows)[:, None].expand(256, 256)
+    found = measure(PictureExemplar(waves, 2 / 256), np.random.default_rng(0))
+    assert found.wavelength == pytest.approx(2 / 8, rel=0.15)
+    assert found.directed > 0.5
+
+
+def test_patches_of_a_picture_are_its_parts():
+    picture = torch.rand(64, 64, generator=torch.Generator().manual_seed(0))
+    patches = PictureExemplar(picture, 1 / 64).patches(
+        20, 5, 1 / 64, np.random.default_rng(0), False
+    )
+    assert patches.shape == (20, 5, 5)
+    assert float(patches.min()) >= float(picture.min()) - 1e-6
+    assert float(patches.std()) > 0.1
+
+
+def test_the_nearest_patch_is_the_nearest():
+    """As a search through all of them says, with the weights that the bank compares with."""
+    made = torch.rand(300, 9, 9, generator=torch.Generator().manual_seed(1))
+    known = bank(made)
+    wanted = torch.tensor([5, 17, 200])
+    best, misfit = known.nearest(made.flatten(1)[wanted] + 1e-3)
+    assert best.tolist() == wanted.tolist()
+    assert float(misfit.max()) < 0.01
+
+
+def test_heights_get_the_distribution_and_keep_their_order():
+    heights, like = torch.tensor([0.1, 0.3, 0.2, 0.9]), torch.linspace(-1, 1, 1000)
+    found = matched(heights, like)
+    assert found.argsort().tolist() == heights.argsort().tolist()
+    assert float(found.min()) == pytest.approx(-1)
+    assert float(found.max()) == pytest.approx(1)
+
+
+def test_room_is_half_the_thickness_inside_and_half_the_gap_outside():
+    low, high = trimesh.creation.box([4, 4, 0.4]), trimesh.creation.box([4, 4, 0.4])
+    high.apply_translation([0, 0, 0.6])  # 0.2 apart
+    both = trimesh.util.concatenate([low, high]).subdivide_to_size(0.1)
+    fine = meshes.from_arrays(both.vertices, both.faces)
+    sheet = Sheet(fine.vertices, fine.faces)
+    middle = (np.abs(sheet.vertices[:, :2]) < 1).all(axis=1)
+    top_of_low = middle & (np.abs(sheet.vertices[:, 2] - 0.2) < 1e-6)
+    assert ball_radius(sheet, -1, 1.0)[top_of_low] == pytest.approx(0.2, rel=0.05)
+    assert ball_radius(sheet, 1, 1.0)[top_of_low] == pytest.approx(0.1, rel=0.05)
+
+
+def test_many_components_are_one_relief():
+    """Overlapping balls round a big one: bumps as high as the balls stand out."""
+    ways = shapes._fibonacci(40)
+    balls = [trimesh.creation.icosphere(2, radius=0.3).apply_translation(0.8 * way) for way in ways]
+    joined = trimesh.util.concatenate([trimesh.creation.icosphere(3, radius=0.7), *balls])
+    exemplar = exemplar_of(meshes.from_arrays(joined.vertices, joined.faces))
+    assert np.isfinite(exemplar.height).all()
+    assert 0.03 < np.ptp(np.percentile(exemplar.height, [2, 98])) < 0.25
+    out = exemplar.sheet.vertices / np.linalg.norm(exemplar.sheet.vertices, axis=1, keepdims=True)
+    nearness = (out @ ways.T).max(axis=1)
+    assert np.corrcoef(exemplar.height, nearness)[0, 1] > 0.6  # highest in the middle of a ball
+
+
+@pytest.fixture(scope="module")
+def striped():
+    return styleexp.stylize("sphere", "stripe", *CHEAP)
+
+
+def test_stripes_on_a_sphere_are_level_and_as_high_as_the_styles(striped):
+    vertices, moved = striped.vertices, striped.displacement
+    level = np.abs(vertices[:, 1]) < 0.6
+    # Over the latitude nearly all of the height is explained; round the axis nothing is left.
+    bins = np.digitize(vertices[level, 1], np.linspace(-0.6, 0.6, 60))
+    means = np.bincount(bins, moved[level]) / np.bincount(bins).clip(min=1)
+    assert np.var(moved[level] - means[bins]) < 0.5 * np.var(moved[level])
+    style = relief_of_mesh(shapes.make("stripe")).height
+    assert moved.std() == pytest.approx(style.std(), rel=0.35)
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_seed_another_relief(striped):
+    again = styleexp.stylize("sphere", "stripe", *CHEAP)
+    assert (again.vertices == striped.vertices).all()
+    other = styleexp.stylize("sphere", "stripe", *CHEAP, "optim.seed=1")
+    assert not np.allclose(other.vertices, striped.vertices)
+
+
+def test_strength_zero_gives_the_source_back_and_no_face_turns_over(striped):
+    flat = styleexp.stylize("torus", "bubble", *CHEAP, "strength=0")
+    assert (flat.vertices == flat.scene.source.vertices).all()
+    source = trimesh.Trimesh(striped.scene.source.vertices, striped.faces, process=False)
+    facing = (source.face_normals * striped.trimesh().face_normals).sum(1)
+    assert facing.min() > 0
+
+
+@pytest.mark.parametrize(
+    ("style", "options", "told"),
+    [
+        ("sphere", (), "has no relief to speak of"),
+        (np.full((40, 40), 0.5), (), "has no relief to speak of"),
+        ("bubble", ("baseline.direction=north",), "baseline.direction=north is not allowed"),
+        ("bubble", ("baseline.bank=3",), "baseline.bank=3 is not allowed"),
+    ],
+)
+def test_what_can_not_be_laid_is_said_in_one_sentence(style, options, told):
+    with pytest.raises(UserError, match=told):
+        styleexp.stylize("torus", style, *CHEAP, *options)
