@@ -20,8 +20,10 @@ API = {
     "The method": (
         "stylize", "scene", "fields", "height_maps", "geometry", "views", "viewer", "losses", "styles", "relief", "config", "baselines", "baselines.geometric_textures",
     ),
+    "Synthesis on the surface": ("synthesis", "synthesis.method", "synthesis.shape", "synthesis.exemplar",
+                                 "synthesis.direction", "synthesis.walk", "synthesis.optimise", "synthesis.room"),
     "Meshes and pictures": ("meshes", "meshes.mesh", "meshes.reading", "meshes.writing",
-                            "meshes.remeshing", "meshes.welding", "meshes.joining", "meshes.precision",
+                            "meshes.remeshing", "meshes.refining", "meshes.memory", "meshes.welding", "meshes.joining", "meshes.precision",
                             "meshes.gltf", "meshes.accessors", "meshes.gltf_writing", "meshes.gltf_making",
                             "meshes.ply", "meshes.ply_meshes", "meshes.obj", "deep_images", "images", "shapes", "assets", "sources", "bake"),
     "Renderers": ("renderers.base", "renderers.soft_raster", "renderers.soft_raster.renderer",
