@@ -131,6 +131,18 @@ def test_damaged_checkpoint_falls_back_to_the_one_before_and_says_so(finished, t
     assert (folder / "result.ply").read_bytes() == (finished[0] / "result.ply").read_bytes()
 
 
+def test_what_another_run_left_unfinished_is_not_replaced_without_a_word(finished, tmp_path):
+    import shutil
+
+    folder = tmp_path / "run"
+    shutil.copytree(finished[0], folder)
+    (folder / "status.json").write_text(json.dumps({"status": "interrupted"}))
+    given = ["source=torus", "style=bubble", *SMOKE, "hydra.run.dir=run", "report=false"]
+    done = command(*given, "optim.steps=3", "preview.turntable_frames=1", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "had other settings, files or another version: it is replaced" in done.stdout
+
+
 def test_resume_refuses_what_is_no_run(tmp_path):
     assert "no run.json" in complaint(command(f"resume={tmp_path}", cwd=tmp_path))
     told = complaint(command(f"resume={tmp_path}", "optim.steps=9", cwd=tmp_path))

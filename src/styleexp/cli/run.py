@@ -64,6 +64,11 @@ def begin(config: Config, folder: Path, overrides: list[str]) -> int:
     run_folder = records.RunFolder(folder)
     unfinished = run_folder.unfinished(record)
     if unfinished is None:
+        if runs.status(folder) in ("running", "interrupted"):
+            print(
+                f"note: what was begun in '{folder}' had other settings, files or another version: "
+                "it is replaced"
+            )
         run_folder.clear()
     return _guarded(config, run_folder, unfinished or record, resumed=unfinished is not None)
 
