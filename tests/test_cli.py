@@ -143,8 +143,22 @@ def test_what_another_run_left_unfinished_is_not_replaced_without_a_word(finishe
     assert "had other settings, files or another version: it is replaced" in done.stdout
 
 
+def test_a_refused_command_costs_no_result_that_is_there(finished, tmp_path):
+    import shutil
+
+    folder = tmp_path / "run"
+    shutil.copytree(finished[0], folder)
+    before = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+    (tmp_path / "junk.obj").write_text("junk")
+    done = command("junk.obj", "bubble", *SMOKE, "hydra.run.dir=run", cwd=tmp_path)
+    assert "junk.obj" in complaint(done)
+    assert {name: (folder / name).read_bytes() for name in before} == before
+
+
 def test_resume_refuses_what_is_no_run(tmp_path):
     assert "no run.json" in complaint(command(f"resume={tmp_path}", cwd=tmp_path))
+    twice = command(f"resume={tmp_path}", f"resume={tmp_path}", cwd=tmp_path)
+    assert "give it once" in complaint(twice)
     told = complaint(command(f"resume={tmp_path}", "optim.steps=9", cwd=tmp_path))
     assert "optim.steps=9" in told
 

@@ -137,11 +137,50 @@ def test_a_style_in_memory_is_a_style_from_a_file(ball, tmp_path):
         ("torus", np.zeros((40, 40), np.int64), "picture of int64"),
         ("torus", np.zeros((4, 40)), "at least 16"),
         ("torus", "bubbel", "unknown style 'bubbel'"),
+        ((iter("ab"), iter("ab")), "bubble", "no pair of numeric arrays"),
+        ((np.eye(3) * 1j, np.array([[0, 1, 2]])), "bubble", "complex"),
+        ("torus", np.full((40, 40), 0.5), "a picture of one tone"),
+        ("torus", np.full((40, 40, 3), 255, np.uint8), "a picture of one tone"),
     ],
 )
 def test_what_can_not_be_taken_is_said_in_one_sentence(source, style, told):
     with pytest.raises(UserError, match=told):
         styleexp.stylize(source, style, *SMOKE)
+
+
+def test_what_a_trimesh_looks_like_is_kept(ball, tmp_path):
+    from PIL import Image
+
+    uv = ball.vertices[:, :2] / 2 + 0.5
+    image = Image.fromarray(np.arange(192, dtype=np.uint8).reshape(8, 8, 3))
+    painted = trimesh.visual.TextureVisuals(uv=uv, image=image)
+    mesh = trimesh.Trimesh(ball.vertices, ball.faces, process=False, visual=painted)
+    styleexp.stylize(mesh, "bubble", *SMOKE, "strength=0").save(tmp_path / "painted.glb")
+    read = trimesh.load(tmp_path / "painted.glb", process=False, force="mesh")
+    assert np.allclose(read.visual.uv, uv, atol=1e-6)
+    assert (np.asarray(read.visual.material.baseColorTexture.convert("RGB")) == image).all()
+    colours = np.random.default_rng(0).integers(0, 255, (len(ball.vertices), 4), dtype=np.uint8)
+    mesh = trimesh.Trimesh(ball.vertices, ball.faces, process=False, vertex_colors=colours)
+    styleexp.stylize(mesh, "bubble", *SMOKE, "strength=0").save(tmp_path / "coloured.ply")
+    read = trimesh.load(tmp_path / "coloured.ply", process=False)
+    assert (read.visual.vertex_colors == colours).all()
+
+
+@pytest.mark.filterwarnings("default")
+def test_what_was_left_out_is_said_and_faces_stay(ball):
+    more = np.vstack([[[5.0, 5, 5]], ball.vertices]), ball.faces + 1
+    with pytest.warns(UserWarning, match="left out 1 vert"):
+        result = styleexp.stylize(more, "bubble", *SMOKE)
+    assert len(result.faces) == len(ball.faces)
+
+
+@pytest.mark.parametrize("twice", ["style=stripe", "source.path=x.obj", "style.name=stripe"])
+def test_source_and_style_are_given_once(twice):
+    with pytest.raises(UserError, match="are given already"):
+        styleexp.stylize("torus", "bubble", twice)
+    for no_override in ("strength", 7, "-m"):
+        with pytest.raises(UserError, match="is not KEY=VALUE"):
+            styleexp.stylize("torus", "bubble", no_override)
 
 
 def test_a_wrong_override_is_said_as_on_the_command_line():

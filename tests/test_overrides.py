@@ -145,6 +145,9 @@ def test_two_words_are_source_and_style(here):
     assert overrides.understood(["~logger"]) == ["~logger"]  # Hydra's deletion
     with pytest.raises(UserError, match="'x' is one word too many"):
         overrides.understood(["critter", "bubble", "x"])
+    for empty in ("", " ", "source=", "style.path="):
+        with pytest.raises(UserError, match=r"one word is empty|has no value"):
+            overrides.understood(["critter", empty])
     with pytest.raises(UserError, match="the source is given twice"):
         overrides.understood(["critter", "source.path=x.obj"])
 
@@ -158,6 +161,9 @@ def test_a_comma_separates_in_a_sweep_unless_it_belongs_to_a_file(here):
     assert swept("x.obj,a,b.obj,y.obj") == "source.path=x.obj,'a,b.obj',y.obj"
     assert swept("'q,r.obj',y.obj") == "source.path='q,r.obj',y.obj"
     assert swept("glob(*)") == "source.path=glob(*)"
+    (here / "E=f.obj").write_bytes(obj())
+    two = overrides.understood(["E=f.obj,a=b.obj", "bubble"], multirun=True)
+    assert two == ["source.path='E=f.obj','a=b.obj'", "style=bubble"]
     one = overrides.understood(["source=a.obj,b.obj"], multirun=True)
     assert one == ["source.path=a.obj,b.obj"]
     with pytest.raises(UserError, match="mixes files with the name 'critter'"):

@@ -95,6 +95,12 @@ def literal(value: Any) -> Any:
 
 
 def _check_text(word: str) -> None:
+    if not isinstance(word, str):
+        raise UserError(f"the override {word!r} is a {type(word).__name__}: give KEY=VALUE texts.")
+    if not word.strip():
+        raise UserError("one word is empty: give a name or a file as source and style.")
+    if word in ("source=", "style=", "source.path=", "style.path="):
+        raise UserError(f"'{word}' has no value: give a name or a file.")
     try:
         word.encode()
     except UnicodeEncodeError:
@@ -106,13 +112,16 @@ def _check_text(word: str) -> None:
 def _is_override(word: str) -> bool:
     if re.fullmatch(r"~[\w@./-]+", word) and not word.startswith("~/"):
         return not exists(word)  # Hydra's deletion of a key
-    return "=" in word and not (_looks_like_a_file(word) and os.path.isfile(word))
+    return "=" in word and not _is_files(word)
 
 
-def _looks_like_a_file(word: str) -> bool:
+def _is_files(word: str) -> bool:
+    """Whether a word with a ``=`` in it is a file of that name, or several between commas."""
     from styleexp.sources import SUFFIXES
 
-    return Path(word).suffix.lower() in SUFFIXES
+    return all(
+        Path(each).suffix.lower() in SUFFIXES and os.path.isfile(each) for each in _split(word)
+    )
 
 
 def _known(part: str, name: str) -> bool:

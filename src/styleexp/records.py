@@ -58,11 +58,13 @@ PACKAGES = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass
 class RunFolder:
     """Reads and writes one run's files."""
 
     path: Path
+    begun: bool = False
+    """Whether what it holds is the run's that this process is at."""
 
     @property
     def checkpoint(self) -> Path:
@@ -101,6 +103,15 @@ class RunFolder:
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return None
         return before if same else None
+
+    def begin(self, record: Mapping[str, Any] | None) -> None:
+        """Note that a run is at work here: a new one with this record, or the one of before."""
+        if record is not None:
+            self.clear()
+        self.write_status("running")
+        if record is not None:
+            self.write_json("run.json", record)
+        self.begun = True
 
     def clear(self) -> None:
         """Remove what an earlier run left, lest it be taken for the next one's."""

@@ -17,6 +17,7 @@ from styleexp import height_maps, meshes, remembered, styles
 from styleexp.config import check
 from styleexp.errors import UserError
 from styleexp.geometry import Surface, vertex_areas
+from styleexp.images import luminance
 from styleexp.plugins import build
 from styleexp.relief import half_range, mesh_frequency, mesh_relief, picture_frequency
 from styleexp.renderers.base import Shading
@@ -50,6 +51,8 @@ PER_WAVE = 6.0
 """Of the longest edges, on a wavelength of the style's relief, where the source is refined."""
 MOST_REFINED = 400_000
 """Faces that refining aims at, at most."""
+LEAST_CONTRAST = 1e-3
+"""Standard deviation of a picture's tone, of 1, below which it is rounding alone."""
 STRAY = 5.0
 """A mesh has stray faces where a vertex is so many times farther off than 99 of 100 vertices."""
 
@@ -97,6 +100,11 @@ def load(config: Config) -> Subject:
     source = load_source(config.source)
     style = load_style(config.style)
     doing(f"measuring the source ({len(source.faces):,} faces) and the style")
+    if isinstance(style, np.ndarray) and luminance(style).std() < LEAST_CONTRAST:
+        raise UserError(
+            f"the style '{config.style.path or config.style.name}' is a picture of one tone, there "
+            "is nothing to transfer: give one with contrast."
+        )
     unit = pattern_unit(config.style, source, style if isinstance(style, meshes.Mesh) else None)
     sigma, bound, height = choose_field(config.field, style)
     size = 1.0 if config.style.scale_by == "frame" else unit

@@ -8,9 +8,11 @@ views ──► VGG ──► Gram matrices ──► distance to the style's   
 from __future__ import annotations
 
 import math
+import re
 import sys
 import time
 import types
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -134,6 +136,10 @@ def stylize(source: MeshLike, style: MeshLike | np.ndarray, *overrides: str) -> 
     Raises:
         UserError: for what the command line would report.
 
+    Warns:
+        UserWarning: of repairs, of vertices left out or joined (the result's vertices are then not
+            the given ones; its faces are), of a mesh too coarse: what the command line notes.
+
     The process is left as it was: torch's number of threads (``threads=`` holds for this call) and
     its random numbers, and everything of a Hydra application that calls this.
     """
@@ -141,6 +147,8 @@ def stylize(source: MeshLike, style: MeshLike | np.ndarray, *overrides: str) -> 
     with sources.given(**given), process.undisturbed(config):
         method = baselines.method(config)
         scene = method.prepare(config)
+        for note in scene.notes:
+            warnings.warn(note, stacklevel=2)
         state = method.start(scene)
         for _ in method.optimise(scene, state):
             pass
@@ -154,6 +162,11 @@ def configured(
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
+    for override in overrides:
+        if not isinstance(override, str) or not re.match(r"[~+]*[\w@./-]+=|~\w", override):
+            raise UserError(f"the override {override!r} is not KEY=VALUE.")
+        if re.match(r"(source|style)(\.path|\.name)?=", override):
+            raise UserError(f"source and style are given already, so drop '{override}'.")
     named = {"source": source, "style": style}
     known = isinstance(style, str) and plugins.known("style", style)
     try:

@@ -66,6 +66,8 @@ def _command(given: list[str]) -> None:
         print(f"styleexp {__version__}")
         return
     resume = [a for a in given if a.startswith("resume=")]
+    if len(resume) > 1:
+        raise UserError("resume= goes on with one run: give it once.")
     if resume:
         _resume(resume[0].removeprefix("resume="), [a for a in given if a not in resume])
     else:

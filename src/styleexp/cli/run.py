@@ -63,13 +63,11 @@ def begin(config: Config, folder: Path, overrides: list[str]) -> int:
     record = records.describe(config, overrides, ["styleexp", *overrides]) | origins.noted(config)
     run_folder = records.RunFolder(folder)
     unfinished = run_folder.unfinished(record)
-    if unfinished is None:
-        if runs.status(folder) in ("running", "interrupted"):
-            print(
-                f"note: what was begun in '{folder}' had other settings, files or another version: "
-                "it is replaced"
-            )
-        run_folder.clear()
+    if unfinished is None and runs.status(folder) in ("running", "interrupted"):
+        print(
+            f"note: what was begun in '{folder}' had other settings, files or another version: "
+            "it is replaced"
+        )
     return _guarded(config, run_folder, unfinished or record, resumed=unfinished is not None)
 
 
@@ -98,10 +96,11 @@ def _guarded(
 ) -> int:
     """Run, and leave a status whatever happens."""
     atomic.sweep(folder.path)
+    # What is done is replaced only by what can be begun: a mistyped command costs no result.
+    replaced = not resumed and runs.status(folder.path) == "done"
     try:
-        folder.write_status("running")
-        if not resumed:
-            folder.write_json("run.json", record)
+        if not replaced:
+            folder.begin(None if resumed else record)
         with announced():
             return _run(config, folder, record, resumed)
     except BrokenPipeError:  # as with `styleexp ... | head`: the folder is not at fault
@@ -128,7 +127,8 @@ def _guarded(
             "choose another folder with hydra.run.dir=FOLDER."
         ) from error
     except KeyboardInterrupt:
-        folder.write_status("interrupted", reason="stopped by the user")
+        if folder.begun:
+            folder.write_status("interrupted", reason="stopped by the user")
         raise
     except Exception as error:
         if not _out_of_memory(error):
@@ -160,7 +160,8 @@ def _out_of_memory(error: BaseException) -> bool:
 
 def _fail(folder: records.RunFolder, reason: str) -> None:
     with suppress(OSError):  # where it can't be recorded, it is told all the same
-        folder.write_status("failed", reason=reason)
+        if folder.begun:
+            folder.write_status("failed", reason=reason)
 
 
 def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resumed: bool) -> int:
@@ -185,6 +186,8 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
         assets.find(judge, "weights")  # if it can't be had, say so before the run, not after
     method = baselines.method(config)
     scene = method.prepare(config)
+    if not folder.begun:
+        folder.begin(record)
     doing("")
     for note in scene.notes:
         print(f"note: {note}")

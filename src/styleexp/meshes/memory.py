@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,7 +32,7 @@ def from_memory(given: Any, kind: str) -> Mesh | Float[np.ndarray, "height width
         if isinstance(given, tuple | list) and len(given) == 2:
             return from_arrays(*given)
         if hasattr(given, "vertices") and hasattr(given, "faces"):
-            return from_arrays(given.vertices, given.faces)
+            return from_arrays(given.vertices, given.faces, getattr(given, "visual", None))
     except UserError as error:
         raise UserError(f"the {kind} {error}") from None
     raise UserError(
@@ -41,13 +42,21 @@ def from_memory(given: Any, kind: str) -> Mesh | Float[np.ndarray, "height width
 
 
 def from_arrays(
-    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], visual: Any = None
 ) -> Mesh:
-    """A checked, welded, outward mesh, named ``array``; see `load_mesh`.
+    """A checked, welded, outward mesh, named ``array``; see `load_mesh`. Of a trimesh's ``visual``
+    texture coordinates, the material and the vertices' colours are kept.
 
     Raises `UserError` with the end of a sentence that begins with whose arrays they are.
     """
-    points, corners = np.array(vertices, dtype=np.float64), np.array(faces)
+    try:
+        points, corners = np.array(vertices), np.array(faces)
+        if np.iscomplexobj(points):
+            raise TypeError("complex numbers")
+        points = points.astype(np.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        told = " ".join(str(error).split())[:100].rstrip(".")
+        raise UserError(f"is no pair of numeric arrays ({told}): give (vertices, faces).") from None
     if points.ndim != 2 or points.shape[1] != 3:
         raise UserError(f"has vertices of shape {points.shape}: give (vertices, 3).")
     if corners.ndim != 2 or corners.shape[1] != 3 or not np.issubdtype(corners.dtype, np.integer):
@@ -65,4 +74,26 @@ def from_arrays(
     no_row = np.zeros(len(used), dtype=np.int64)
     rounding = of_floats(points) if np.asarray(vertices).dtype == np.float32 else 0.0
     carrier = Carrier(corners, no_row, np.zeros(len(corners), dtype=bool), precision=rounding)
+    if visual is not None:
+        carrier = replace(carrier, **_looks(visual, used, len(corners), notes))
     return weld("array", points[used], carrier, notes)
+
+
+def _looks(visual: Any, used: np.ndarray, faces: int, notes: list[str]) -> dict[str, Any]:
+    """What a `Carrier` keeps of a trimesh's ``visual``."""
+    if visual.kind == "vertex":
+        return {"colors": np.asarray(visual.vertex_colors, dtype=np.uint8)[used]}
+    if visual.kind == "face":
+        return {"face_colors": np.asarray(visual.face_colors, dtype=np.uint8)}
+    if visual.kind != "texture" or visual.uv is None:
+        return {}
+    material = visual.material
+    if hasattr(material, "to_pbr"):
+        material = material.to_pbr()
+    if material.name is None:
+        material.name = "material"
+    return {
+        "uv": np.asarray(visual.uv, dtype=np.float64)[used],
+        "materials": (material,),
+        "face_material": np.zeros(faces, dtype=np.int64),
+    }

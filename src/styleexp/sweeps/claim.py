@@ -116,7 +116,7 @@ def _jobs(config: DictConfig, folder: Path) -> list[Job] | None:
 
     if "BasicSweeper" not in config.hydra.sweeper._target_:
         return None
-    listed = product(config.hydra.sweeper.params, list(config.hydra.overrides.task))
+    listed = product(config.hydra.sweeper.params, _given(config))
     loader: Any = GlobalHydra.instance().config_loader()
     jobs, before = [], HydraConfig.instance().cfg
     for number, overrides in enumerate(listed):
@@ -134,12 +134,21 @@ def _jobs(config: DictConfig, folder: Path) -> list[Job] | None:
     return jobs
 
 
+def _given(config: DictConfig) -> list[str]:
+    """The command's overrides in Hydra's grammar: resolved, an escaped "${" of a file's name would
+    be lost."""
+    from omegaconf import OmegaConf
+
+    given: Any = OmegaConf.to_container(config.hydra.overrides.task, resolve=False)
+    return given
+
+
 def _search(config: DictConfig) -> dict[str, Any]:
     """What a search asks for, as its jobs aren't known beforehand."""
     from omegaconf import OmegaConf
 
     return {
-        "overrides": list(config.hydra.overrides.task),
+        "overrides": _given(config),
         "sweeper": json.loads(
             json.dumps(OmegaConf.to_container(config.hydra.sweeper, resolve=True), default=str)
         ),
