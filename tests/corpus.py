@@ -918,7 +918,7 @@ def _text() -> None:
         shown = name if len(name) < 50 else f"{name[:10]}... ({len(name)} characters)"
         case(group, name, f"the name {shown!r}", obj(), WORKS, **BALL)
     case(group, ".obj", "a name that is an extension alone", obj(), REFUSED, "no extension")
-    case(group, "model.fbx", "a format that isn't read", JUNK, REFUSED, "supported mesh files")
+    case(group, "model.fbx", "a format that isn't read", JUNK, REFUSED, "export it as GLB")
     case(group, "model", "no extension", obj(), REFUSED, "no extension")
     case(group, "folder.obj/inside.txt", "a folder called like a mesh", TEXT, REFUSED)
 
@@ -1748,7 +1748,13 @@ def _pictures() -> None:
         REFUSED,
         "SVG",
     )
-    add("drawing.svg", "an SVG", b"<svg xmlns='http://www.w3.org/2000/svg'/>", REFUSED, "a picture")
+    add(
+        "drawing.svg",
+        "an SVG",
+        b"<svg xmlns='http://www.w3.org/2000/svg'/>",
+        REFUSED,
+        "export it as PNG",
+    )
     add("notes.png", "text called .png", TEXT, REFUSED, "text file")
     add("page.jpg", "a web page called .jpg", HTML, REFUSED, "web page")
     add("print.png", "an EPS called .png", b"%!PS-Adobe-3.0 EPSF-3.0\n", REFUSED, "text file")

@@ -36,6 +36,8 @@ def new_glb(
     used = {material: k for k, material in enumerate(sorted({m for _, m, _ in runs if m >= 0}))}
     for material in used:
         file.material(carrier.materials[material], textured=carrier.uv is not None)
+    if carrier.uv is not None and any(material < 0 for _, material, _ in runs):
+        used[-1] = file.plain_material()  # some readers drop coordinates where there is none
     for part, by_material in pieces.items():
         primitives = []
         for material, faces in by_material.items():
@@ -52,7 +54,9 @@ def new_glb(
             small = len(rows) < 65535  # of which the last is not an index
             indices = corners.reshape(-1, 1).astype(np.uint16 if small else np.uint32)
             primitive = {"attributes": attributes, "indices": file.accessor(indices, INDEX)}
-            primitives.append(primitive | ({"material": used[material]} if material >= 0 else {}))
+            if material in used:
+                primitive["material"] = used[material]
+            primitives.append(primitive)
         file.node(carrier.parts[part], primitives)
     return file.glb()
 
@@ -146,6 +150,10 @@ class _File:
         if material.doubleSided:
             entry["doubleSided"] = True
         self._add("materials", entry)
+
+    def plain_material(self) -> int:
+        """One that looks like none."""
+        return self._add("materials", {"name": "material"})
 
     def _texture(self, image: Any) -> int:
         if id(image) not in self.images:
