@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 COMPONENTS = 24
 """Principal components by which patches are compared."""
 SAMPLES = 40_000
-"""Of the exemplar's heights, for their distribution."""
+"""Of the exemplar's heights, for their deviation."""
+MOST_GAIN = 1.5
+"""Of the heights, against what blur took of them."""
 AT_ONCE = 256
 """Grids that are compared with the whole bank at once: the distances then fit a cache."""
 TRUST = 0.6
@@ -120,10 +122,13 @@ def synthesise(
             done += 1
             yield done, height
     assert height is not None
-    # A vote is a mean, and a patch is blurred to its level: some of each vertex's own best patch,
-    # and the exemplar's heights as they are, give edges and depth back.
-    own = exemplar.patches(SAMPLES, 1, 1e-6, rng, any_way).flatten()
-    yield done, matched(0.7 * height + 0.3 * known.middles[best], own)
+    # A vote is a mean, and a patch is blurred to its level: some of each vertex's own best patch
+    # gives edges back, and a gain the depth. (The exemplar's own distribution, unblurred, would
+    # broaden its ridges: a mesh can't hold slopes as steep.)
+    height = 0.7 * height + 0.3 * known.middles[best]
+    own = exemplar.patches(SAMPLES, 1, 1e-6, rng, any_way)
+    gain = float(own.std() / height.std().clamp(min=1e-12))
+    yield done, height.mean() + min(gain, MOST_GAIN) * (height - height.mean())
 
 
 def matched(
