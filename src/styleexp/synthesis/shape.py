@@ -60,8 +60,11 @@ def _along_itself(mesh: meshes.Mesh) -> MeshExemplar:
         options={"SymmetricMode": True},
     )
     base = solver.solve(mass @ vertices)
-    height = ((vertices - base) * meshes.vertex_normals(base, mesh.faces)).sum(axis=1)
-    return MeshExemplar(Sheet(base, mesh.faces), height - height.mean())
+    normals = meshes.vertex_normals(base, mesh.faces)
+    height = ((vertices - base) * normals).sum(axis=1)
+    # Smoothing draws vertices sideways, too, off steep walls: each height belongs below its vertex.
+    base = vertices - height[:, None] * normals
+    return MeshExemplar(Sheet(base, mesh.faces, normals), height - height.mean())
 
 
 def _components(mesh: meshes.Mesh) -> int:
