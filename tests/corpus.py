@@ -1696,8 +1696,9 @@ def _pictures() -> None:
     )
     add("strip.png", "30000x16", picture("PNG", np.resize(pixels()[..., 0], (16, 30000))))
     add("least.png", "16x16", picture("PNG", pixels(16, 16)))
-    add("black.png", "black all over", picture("PNG", np.zeros((64, 64), np.uint8)))
-    add("clear.png", "wholly transparent", picture("PNG", np.zeros((64, 64, 4), np.uint8)))
+    black, clear = np.zeros((64, 64), np.uint8), np.zeros((64, 64, 4), np.uint8)
+    add("black.png", "black all over", picture("PNG", black), REFUSED, "one tone")
+    add("clear.png", "wholly transparent", picture("PNG", clear), REFUSED, "one tone")
 
     def animated(kind: str):
         def make() -> bytes:
