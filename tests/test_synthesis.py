@@ -14,6 +14,7 @@ from styleexp.metrics.patches import relief_of_mesh
 from styleexp.synthesis.direction import FLOW, UP, direction_field, turned
 from styleexp.synthesis.exemplar import MeshExemplar, PictureExemplar, measure
 from styleexp.synthesis.optimise import bank, matched
+from styleexp.synthesis.quilting import quilt
 from styleexp.synthesis.room import ball_radius
 from styleexp.synthesis.shape import exemplar_of
 from styleexp.synthesis.walk import Sheet
@@ -51,12 +52,13 @@ def test_a_walk_over_a_ball_stays_on_it_and_comes_home(ball):
 
 def test_a_grid_on_a_plane_is_a_grid(plane):
     middle = np.array([30 * 61 + 30])
-    points, nears = plane.grids(middle, np.array([[0.0, 1.0, 0.0]]), 5, 0.1)
+    points, nears, ahead = plane.grids(middle, np.array([[0.0, 1.0, 0.0]]), 5, 0.1)
     expected = (np.arange(5) - 2) * 0.1
     assert np.allclose(points[0, :, :, 0], expected[None], atol=1e-12)  # column 0 to the left
     assert np.allclose(points[0, :, :, 1], -expected[:, None], atol=1e-12)  # row 0 ahead
+    assert np.allclose(ahead, [0.0, 1.0, 0.0])
     assert plane.on_the_mesh(points, nears).all()
-    beyond, nears = plane.grids(np.array([0]), np.array([[0.0, 1.0, 0.0]]), 9, 0.1)
+    beyond, nears, _ = plane.grids(np.array([0]), np.array([[0.0, 1.0, 0.0]]), 9, 0.1)
     assert not plane.on_the_mesh(beyond, nears).all()
 
 
@@ -122,10 +124,10 @@ def test_a_pictures_waves_are_measured_in_its_own_size():
 
 def test_patches_of_a_picture_are_its_parts():
     picture = torch.rand(64, 64, generator=torch.Generator().manual_seed(0))
-    patches = PictureExemplar(picture, 1 / 64).patches(
-        20, 5, 1 / 64, np.random.default_rng(0), False
-    )
+    exemplar = PictureExemplar(picture, 1 / 64)
+    patches, places = exemplar.sample(20, 5, 1 / 64, np.random.default_rng(0), False)
     assert patches.shape == (20, 5, 5)
+    assert torch.equal(exemplar.patches(places[3:7], 5, 1 / 64), patches[3:7])
     assert float(patches.min()) >= float(picture.min()) - 1e-6
     assert float(patches.std()) > 0.1
 
@@ -138,6 +140,38 @@ def test_the_nearest_patch_is_the_nearest():
     best, misfit = known.nearest(made.flatten(1)[wanted] + 1e-3)
     assert best.tolist() == wanted.tolist()
     assert float(misfit.max()) < 0.01
+
+
+def test_the_nearest_among_the_like_is_found_from_one_of_them():
+    made = torch.rand(300, 9, 9, generator=torch.Generator().manual_seed(1))
+    known = bank(made)
+    before = known.similar[:, 3]  # each patch's third neighbour
+    grids = made.flatten(1)
+    best, misfit = known.nearer(grids, before)
+    found = (known.similar[before] == torch.arange(300)[:, None]).any(dim=1)
+    assert found.any()
+    assert torch.equal(best[found], torch.arange(300)[found])
+    apart = (known.compared(grids) - known.reduced[best]).square().sum(1)
+    assert torch.allclose(misfit, apart, atol=1e-5)
+
+
+@pytest.mark.parametrize("any_way", [False, True])
+def test_a_quilt_is_the_exemplar_in_each_vertexs_own_frame(plane, any_way):
+    """Of a slope, which no seam hides: where up is turned, patches are turned with it."""
+    rows = torch.arange(400) / 400
+    slope = PictureExemplar((-rows[:, None]).expand(400, 400), 4 / 400)  # falls by 1 over 4, down
+    angle = 0.7
+    ahead = np.broadcast_to([np.sin(angle), np.cos(angle), 0.0], plane.vertices.shape)
+    laid = quilt(plane, ahead, slope, 0.05, 0.05, 1.0, any_way, np.random.default_rng(0))
+    inner = np.flatnonzero(np.abs(plane.vertices[:, :2]).max(axis=1) < 0.7)
+    patches = laid.patches(torch.from_numpy(inner), 3, 0.05)
+    steps = patches[:, :, 1] - patches[:, :, 7]  # from the row below to that above: 0.1
+    if any_way:  # a piece as a whole is turned, how steep it is stays
+        steps = (steps**2 + (patches[:, :, 3] - patches[:, :, 5]) ** 2).sqrt()
+    # But at the picture's border, where it is mirrored.
+    assert ((steps - 0.1 / 4).abs() < 1e-4).float().mean() > 0.9
+    heights = laid.heights().numpy()[inner]
+    assert np.allclose(heights, patches[:, 0, 4].numpy(), atol=1e-6)
 
 
 def test_heights_get_the_distribution_and_keep_their_order():

@@ -47,9 +47,9 @@ PICTURE_DETAIL = 128
 """Pixels on a picture's longer side when its frequency is measured; finer detail doesn't count."""
 
 
-PER_WAVE = 6.0
+PER_WAVE = 10.0
 """Of the longest edges, on a wavelength of the style's relief, where the source is refined."""
-MOST_REFINED = 400_000
+MOST_REFINED = 250_000
 """Faces that refining aims at, at most."""
 LEAST_CONTRAST = 1e-3
 """Standard deviation of a picture's tone, of 1, below which it is rounding alone."""

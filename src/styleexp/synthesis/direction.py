@@ -6,25 +6,26 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import coo_matrix, diags
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import cg
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
     from styleexp.synthesis.walk import Sheet
 
-FLOW, UP = 0.05, 1.0
-"""How much a wish counts beside smoothness: little, and the field flows along the form; much, and
-it holds the wish wherever the surface allows it."""
+FLOW, UP = 0.08, 0.018
+"""Over which length smoothness counts as much as the wish, in units of the vertices: over a long
+one the field flows along the form; over a short one it holds the wish wherever the surface
+allows it."""
 
 
 def direction_field(
-    sheet: Sheet, wish: Float[np.ndarray, "vertices 3"], weight: float
+    sheet: Sheet, wish: Float[np.ndarray, "vertices 3"], length: float
 ) -> Float[np.ndarray, "vertices 3"]:
     """The unit tangent field that turns least from vertex to vertex (connection Laplacian) while it
-    follows ``wish`` where that lies in the surface.
+    follows ``wish`` where that lies in the surface; ``length`` is `FLOW`, `UP` or another.
 
-    One sparse complex solve. ``wish`` need be neither unit nor tangent; where it stands upright on
+    One sparse complex system. ``wish`` need be neither unit nor tangent; where it stands upright on
     the surface it has no say.
     """
     vertices, normals = sheet.vertices, sheet.normals
@@ -41,14 +42,13 @@ def direction_field(
     laplacian = coo_matrix((both, (rows, columns)), (count, count)).tocsc()
     degree = np.bincount(rows, minlength=count)
     tangent = wish - (wish * normals).sum(1, keepdims=True) * normals
-    say = weight * np.linalg.norm(tangent, axis=1) ** 2
+    say = sheet.areas / length**2 * np.linalg.norm(tangent, axis=1) ** 2
     asked = (tangent * x).sum(1) + 1j * (tangent * y).sum(1)
     asked = say * asked / np.abs(asked).clip(min=1e-9)
     # A component that the wish says nothing of would leave the matrix singular.
-    matrix = (laplacian + diags(degree + say + 1e-6)).tocsc()
-    # Hermitian and positive definite: an ordering for such, without pivots, takes a third.
-    solver = splu(matrix, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    field = solver.solve(asked + 1e-9)
+    diagonal = degree + say + 1e-6
+    matrix = (laplacian + diags(diagonal)).tocsr()
+    field = cg(matrix, asked + 1e-9, rtol=1e-6, M=diags(1 / diagonal))[0]
     field /= np.abs(field).clip(min=1e-300)
     return field.real[:, None] * x + field.imag[:, None] * y
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 import numpy as np
 import torch
@@ -36,6 +36,10 @@ CLEAR = 0.05
 """A rise of the heights' likeness, in shares of their variance, that is no chance."""
 
 
+Places: TypeAlias = "Float[np.ndarray, 'places numbers']"
+"""Where patches are taken, a row of numbers each, which only their exemplar understands."""
+
+
 class Exemplar(Protocol):
     """Where patches come from."""
 
@@ -44,11 +48,17 @@ class Exemplar(Protocol):
         """Length of the whole."""
         ...
 
-    def patches(
+    def sample(
         self, count: int, side: int, spacing: float, rng: np.random.Generator, any_way: bool
+    ) -> tuple[Float[Tensor, "patches side side"], Places]:
+        """At most ``count`` patches of heights at a spacing, blurred to it, row 0 up, and where
+        they are from. ``any_way`` turns each by an angle of its own."""
+        ...
+
+    def patches(
+        self, places: Places, side: int, spacing: float
     ) -> Float[Tensor, "patches side side"]:
-        """At most ``count`` patches of heights at a spacing, blurred to it; row 0 lies up.
-        ``any_way`` turns each by an angle of its own."""
+        """The patches of these places."""
         ...
 
 
@@ -66,27 +76,44 @@ class MeshExemplar:
         """Which way is up."""
         return direction_field(self.sheet, np.broadcast_to(Y, self.sheet.vertices.shape), UP)
 
-    def patches(
+    def sample(
         self, count: int, side: int, spacing: float, rng: np.random.Generator, any_way: bool
-    ) -> Float[Tensor, "patches side side"]:
-        """See `Exemplar`."""
+    ) -> tuple[Float[Tensor, "patches side side"], Places]:
+        """See `Exemplar`. A place is a vertex and the unit tangent that is up there."""
         sheet = self.sheet
         lying = np.linalg.norm(np.cross(sheet.normals, Y), axis=1)
         allowed = np.flatnonzero((lying > UPRIGHT) | any_way)
         # Vertices stand for the area around them: dense parts of a mesh don't count more.
-        share = _areas(sheet)[allowed]
+        share = sheet.areas[allowed]
         start = rng.choice(allowed, count, p=share / share.sum())
         ahead = self.ahead[start]
         if any_way:
             ahead = turned(ahead, sheet.normals[start], rng.uniform(0, 2 * np.pi, count))
-        points, nears = sheet.grids(start, ahead, side, spacing)
-        seen = sheet.on_the_mesh(points, nears).mean(axis=(1, 2)) >= LEAST_SEEN
-        flat, near = points[seen].reshape(-1, 3), nears[seen].ravel()
+        places = np.concatenate([start[:, None], ahead], axis=1)
+        patches, seen = self._patches(places, side, spacing)
+        whole = seen >= LEAST_SEEN
+        return patches[torch.from_numpy(whole)], places[whole]
+
+    def patches(
+        self, places: Places, side: int, spacing: float
+    ) -> Float[Tensor, "patches side side"]:
+        """See `Exemplar`."""
+        return self._patches(places, side, spacing)[0]
+
+    def _patches(
+        self, places: Places, side: int, spacing: float
+    ) -> tuple[Float[Tensor, "patches side side"], Float[np.ndarray, " patches"]]:
+        """Patches, and how much of each lies on the mesh."""
+        sheet = self.sheet
+        start = places[:, 0].astype(np.int64)
+        points, nears, _ = sheet.grids(start, places[:, 1:], side, spacing)
+        seen = sheet.on_the_mesh(points, nears).mean(axis=(1, 2))
         height = self.height
         if spacing > 1.5 * sheet.edge:
             height = smoother(sheet.vertices, sheet.faces, 2 * spacing)(height)
-        sampled = sheet.interpolation(flat, near) @ height.astype(np.float32)
-        return torch.from_numpy(sampled).float().view(-1, side, side)
+        sampling = sheet.interpolation(points.reshape(-1, 3), nears.ravel())
+        sampled = sampling @ height.astype(np.float32)
+        return torch.from_numpy(sampled).float().view(-1, side, side), seen
 
 
 @dataclass(frozen=True)
@@ -102,8 +129,21 @@ class PictureExemplar:
         """Length of the longer side."""
         return self.pixel * max(self.height.shape)
 
-    def patches(
+    def sample(
         self, count: int, side: int, spacing: float, rng: np.random.Generator, any_way: bool
+    ) -> tuple[Float[Tensor, "patches side side"], Places]:
+        """See `Exemplar`. A place is a row, a column, and the angle of up, clockwise."""
+        reach = (side // 2) * spacing / self.pixel * (np.sqrt(2) if any_way else 1.0)
+        middle = [
+            rng.uniform(min(reach, size / 2), max(size - reach, size / 2), count)
+            for size in self.height.shape
+        ]
+        angle = rng.uniform(0, 2 * np.pi, count) if any_way else np.zeros(count)
+        places = np.stack([*middle, angle], axis=1)
+        return self.patches(places, side, spacing), places
+
+    def patches(
+        self, places: Places, side: int, spacing: float
     ) -> Float[Tensor, "patches side side"]:
         """See `Exemplar`."""
         step = spacing / self.pixel
@@ -111,17 +151,11 @@ class PictureExemplar:
         if step > 1:
             height = blurred(height, 0.45 * step)
         rows, columns = self.height.shape
-        angle = rng.uniform(0, 2 * np.pi, count) if any_way else np.zeros(count)
-        reach = (side // 2) * step * (np.sqrt(2) if any_way else 1.0)
-        middle = [
-            rng.uniform(min(reach, size / 2), max(size - reach, size / 2), count)
-            for size in (rows, columns)
-        ]
         across = (torch.arange(side) - side // 2) * step
         down, right = torch.meshgrid(across, across, indexing="ij")
-        cos, sin = (torch.from_numpy(f(angle)).float()[:, None, None] for f in (np.cos, np.sin))
-        y = torch.from_numpy(middle[0]).float()[:, None, None] + cos * down + sin * right
-        x = torch.from_numpy(middle[1]).float()[:, None, None] - sin * down + cos * right
+        y, x, angle = (torch.from_numpy(each).float()[:, None, None] for each in places.T)
+        y = y + torch.cos(angle) * down + torch.sin(angle) * right
+        x = x - torch.sin(angle) * down + torch.cos(angle) * right
         grid = torch.stack([2 * x / columns - 1, 2 * y / rows - 1], dim=-1)
         sampled = functional.grid_sample(
             height[None], grid.view(1, -1, side, 2), padding_mode="reflection", align_corners=False
@@ -147,7 +181,7 @@ def measure(exemplar: Exemplar, rng: np.random.Generator) -> Pattern:
     """Wavelength, direction and height of an exemplar, by the autocovariance of its heights."""
     for samples in (60, 150, 375):
         spacing = exemplar.extent / samples
-        patches = exemplar.patches(1000, SPECTRUM, spacing, rng, any_way=False)
+        patches, _ = exemplar.sample(1000, SPECTRUM, spacing, rng, any_way=False)
         centred = patches - patches.mean()
         middle = centred[:, SPECTRUM // 2, SPECTRUM // 2, None, None]
         likeness = (middle * centred).mean(0) / centred.square().mean().clamp(min=1e-20)
@@ -183,10 +217,3 @@ def _polar(values: Tensor, radii: Tensor, angles: Tensor) -> Tensor:
     y = radii[None] * torch.sin(angles)[:, None] / (half + 0.5)
     grid = torch.stack([x, y], dim=-1).float()[None]
     return functional.grid_sample(values[None, None].float(), grid, align_corners=False)[0, 0]
-
-
-def _areas(sheet: Sheet) -> Float[np.ndarray, " vertices"]:
-    from styleexp import meshes
-
-    third = meshes.face_areas(sheet.vertices, sheet.faces) / 3
-    return np.bincount(sheet.faces.ravel(), np.repeat(third, 3), minlength=len(sheet.vertices))

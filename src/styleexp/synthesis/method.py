@@ -33,12 +33,13 @@ if TYPE_CHECKING:
 
 DIRECTED = 0.25
 """A `Pattern.directed` above this has a direction."""
-PER_WAVE = 2.7
-"""Samples on a wavelength at the coarsest level, where what lies where is decided."""
-COARSEST = 0.12
-"""Longest spacing of a patch's samples, in units of the pattern: wider patches than nine of these
-fit on few parts of a mesh."""
-ROUNDS = (12, 8, 6, 4)
+PER_WAVE = 5.4
+"""Samples on a wavelength at the coarsest level. What is larger than a patch of so many samples the
+quilt has decided already; coarser patches would smooth it away."""
+COARSEST = 0.06
+"""Longest spacing of a patch's samples, in units of the pattern: larger pieces of the quilt fit on
+few parts of a mesh."""
+ROUNDS = (10, 6, 3)
 """Of the levels, from coarse to fine."""
 FLAT = 1e-4
 """A relief lower than this, in units of the pattern, is none."""
@@ -91,7 +92,7 @@ class Synthesis:
         for number, height in synthesise(  # noqa: B007  the last is the result
             sheet, ahead, exemplar, levels, scene.unit, not directed, rng, most=self.config.bank
         ):
-            doing(f"laying the relief, round {min(number + 1, total)} of {total}")
+            doing(f"laying the relief, round {number} of {total}")
         displacement = height.double() * scene.unit * scene.config.strength
         displacement *= torch.from_numpy(fade(sheet, half_range(displacement.numpy())))
         displacement = zero_mean(displacement, scene.areas.cpu().double(), math.inf)
@@ -125,16 +126,10 @@ def exemplar_of_style(scene: Subject) -> MeshExemplar | PictureExemplar:
 def levels_of(pattern: Pattern, edge: float) -> list[Level]:
     """Spacings from the pattern's wavelength down to the mesh's edges (in units of the pattern),
     halved from level to level."""
-    spacing = min(pattern.wavelength / PER_WAVE, COARSEST)
-    levels = []
-    for rounds in ROUNDS:
-        last = spacing / 2 < 0.8 * edge or rounds == ROUNDS[-1]
-        share = 1.0 if last else min(1.0, (2 * edge / spacing) ** 2)
-        levels.append(Level(spacing, rounds, share))
-        if last:
-            break
-        spacing /= 2
-    return levels
+    coarsest = min(pattern.wavelength / PER_WAVE, COARSEST)
+    spacings = [coarsest / 2**number for number in range(len(ROUNDS))]
+    carried = [each for each in spacings[1:] if each >= 0.8 * edge]
+    return [Level(*each) for each in zip([coarsest, *carried], ROUNDS, strict=False)]
 
 
 def told(scene: Subject, pattern: Pattern, directed: bool, levels: list[Level]) -> str:

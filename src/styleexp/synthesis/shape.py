@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import cg
 
 from styleexp import meshes
 from styleexp.synthesis.exemplar import MeshExemplar
@@ -48,18 +48,14 @@ def _along_itself(mesh: meshes.Mesh) -> MeshExemplar:
     vertices = meshes.normalisation(mesh.vertices).apply(mesh.vertices)
     laplacian = gpytoolbox.cotangent_laplacian(vertices, mesh.faces)
     laplacian.data = np.nan_to_num(laplacian.data, posinf=0.0, neginf=0.0)  # of flat faces
-    third = meshes.face_areas(vertices, mesh.faces) / 3
-    area = np.bincount(mesh.faces.ravel(), np.repeat(third, 3), minlength=len(vertices))
-    mass = diags(area.clip(min=1e-9 * area.mean()))
+    area = Sheet(vertices, mesh.faces).areas
+    mass = area.clip(min=1e-9 * area.mean())
     # A wave of LENGTH is damped to a fifth, as by `relief.smoother`.
     time = 4 * (LENGTH / (2 * np.pi)) ** 2
-    solver = splu(
-        (mass + time * laplacian).tocsc(),
-        "MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )
-    base = solver.solve(mass @ vertices)
+    matrix = (diags(mass) + time * laplacian).tocsr()
+    inverse = diags(1 / matrix.diagonal())
+    columns = [cg(matrix, mass * each, each, rtol=1e-8, M=inverse)[0] for each in vertices.T]
+    base = np.stack(columns, axis=1)
     normals = meshes.vertex_normals(base, mesh.faces)
     height = ((vertices - base) * normals).sum(axis=1)
     # Smoothing draws vertices sideways, too, off steep walls: each height belongs below its vertex.

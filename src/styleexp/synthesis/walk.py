@@ -66,22 +66,27 @@ class Sheet:
         ahead: Float[np.ndarray, "grids 3"],
         side: int,
         spacing: float,
-    ) -> tuple[Float[np.ndarray, "grids side side 3"], Int[np.ndarray, "grids side side"]]:
+    ) -> tuple[
+        Float[np.ndarray, "grids side side 3"],
+        Int[np.ndarray, "grids side side"],
+        Float[np.ndarray, "grids side side 3"],
+    ]:
         """Points of a grid of ``side`` x ``side`` (odd) round each start vertex, walked over the
         mesh: first along ``ahead``, then to both sides; row 0 lies ahead, column 0 to the left.
-        With them the vertices nearest to them."""
+        With them the vertices nearest to them, and ``ahead`` as carried along."""
         half = side // 2
-        points = np.empty((len(start), side, side, 3))
+        points, carried = (np.empty((len(start), side, side, 3)) for _ in range(2))
         nears = np.empty((len(start), side, side), dtype=np.int64)
 
         def row(number: int, state: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
-            points[:, number, half], nears[:, number, half] = state[0], state[2]
             for sign in (1, -1):
                 at = state
-                for column in range(1, half + 1):
-                    at = self.step(*at, (0.0, sign * spacing))
-                    points[:, number, half + sign * column] = at[0]
-                    nears[:, number, half + sign * column] = at[2]
+                for column in range(half + 1):
+                    if column:
+                        at = self.step(*at, (0.0, sign * spacing))
+                    place = number, half + sign * column
+                    for each, part in zip((points, carried, nears), at, strict=True):
+                        each[:, *place] = part
 
         middle = self.vertices[start], ahead, start
         row(half, middle)
@@ -90,7 +95,7 @@ class Sheet:
             for count in range(1, half + 1):
                 at = self.step(*at, (sign * spacing, 0.0))
                 row(half - sign * count, at)
-        return points, nears
+        return points, nears, carried
 
     def on_the_mesh(
         self, points: Float[np.ndarray, "... 3"], nears: Int[np.ndarray, ...]
@@ -98,6 +103,21 @@ class Sheet:
         """Whether points, each with its nearest vertex, are not beyond the mesh's boundary."""
         away = np.linalg.norm(points - self.vertices[nears], axis=-1)
         return away < 1.5 * self._reach[nears]
+
+    def spread(self, distance: float, rng: np.random.Generator) -> Int[np.ndarray, " chosen"]:
+        """Some vertices, evenly spread, about that far apart: one of each cell of a grid."""
+        order = rng.permutation(len(self.vertices))
+        cells = np.floor(self.vertices[order] / distance).astype(np.int64)
+        cells -= cells.min(axis=0)
+        sizes = cells.max(axis=0) + 1
+        number = (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
+        return np.sort(order[np.unique(number, return_index=True)[1]])
+
+    @cached_property
+    def areas(self) -> Float[np.ndarray, " vertices"]:
+        """A third of the area of the faces round each vertex."""
+        third = meshes.face_areas(self.vertices, self.faces) / 3
+        return np.bincount(self.faces.ravel(), np.repeat(third, 3), minlength=len(self.vertices))
 
     @cached_property
     def _reach(self) -> Float[np.ndarray, " vertices"]:
