@@ -64,14 +64,15 @@ def displacement(
     scene: Subject, height: float | None = None, patch: float = PATCH, sharpness: float = SHARPNESS
 ) -> Float[Tensor, " vertices"]:
     """The style's height map as a displacement of the source's vertices, zero on average over the
-    surface, in radii of the normalised source.
+    surface (where there is a mask, over what it selects), in radii of the normalised source. The
+    mask is not applied yet.
 
     ``height`` is half its range; the style's own relief's where none is given.
     """
     tile, surface = height_map(scene, patch), scene.surface
     raised = triplanar(tile, surface.vertices, surface.normals, sharpness)
     height = scene.relief if height is None else height
-    return zero_mean(height * raised, scene.areas, math.inf)
+    return zero_mean(height * raised, scene.weights, math.inf)
 
 
 def height_map(scene: Subject, patch: float) -> HeightMap:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from styleexp import height_maps, meshes, remembered, styles
+from styleexp import height_maps, masks, meshes, remembered, styles
 from styleexp.config import check
 from styleexp.errors import UserError
 from styleexp.geometry import Surface, vertex_areas
@@ -76,8 +76,15 @@ class Subject:
     """Displacements lie in (-bound, bound), in radii of the normalised source."""
     relief: float
     """Half the range of the style's own relief, in such radii."""
+    mask: Float[Tensor, " vertices"] | None = None
+    """Factor on the displacement, 0 to 1 (``style.mask``); None is 1 everywhere."""
     notes: tuple[str, ...] = ()
     """What the user should know: repairs, a mesh too coarse for the style."""
+
+    @property
+    def weights(self) -> Float[Tensor, " vertices"]:
+        """The area that each vertex counts for in means over the surface that gets relief."""
+        return self.areas if self.mask is None else self.areas * self.mask
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +105,7 @@ def load(config: Config) -> Subject:
     check(config)
     device = choose_device(config.device)
     source = load_source(config.source)
+    masks.check(config.style, source)
     style = load_style(config.style)
     doing(f"measuring the source ({len(source.faces):,} faces) and the style")
     if isinstance(style, np.ndarray) and luminance(style).std() < LEAST_CONTRAST:
@@ -111,13 +119,16 @@ def load(config: Config) -> Subject:
     if config.source.refine == "auto":
         source = refined(source, size / sigma)
     frame, surface = normalised(source, device)
+    areas = vertex_areas(surface)
+    mask, told = placed(config.style, source, areas)
     return Subject(
         config=config,
         source=source,
         style=style,
         frame=frame,
         surface=surface,
-        areas=vertex_areas(surface),
+        areas=areas,
+        mask=mask,
         unit=unit,
         sigma=sigma / size,
         bound=bound * size,
@@ -128,8 +139,20 @@ def load(config: Config) -> Subject:
             *stray_faces("source", source),
             *(stray_faces("style", style) if isinstance(style, meshes.Mesh) else ()),
             *too_coarse(source, size / sigma),
+            *told,
         ),
     )
+
+
+def placed(
+    config: StyleConfig, source: meshes.Mesh, areas: Float[Tensor, " vertices"]
+) -> tuple[Float[Tensor, " vertices"] | None, list[str]]:
+    """``style.mask`` at the source's vertices, and a note on how much of the surface it selects."""
+    if config.mask is None:
+        return None, []
+    mask = torch.from_numpy(masks.weights(config, source)).to(areas)
+    share = float((areas * mask).sum() / areas.sum())
+    return mask, [f"the relief goes on {100 * share:.1f} % of the surface (style.mask)"]
 
 
 def prepare(config: Config) -> Scene:
