@@ -66,6 +66,17 @@ class StyleConfig:
     falloff: float = 0.05
     """Width of the mask's borders, in radii of the normalised source; half of it lies on each
     side. 0 leaves the mask as it is."""
+    kind: str = "auto"
+    """What a picture's colours are. ``photo``: its tone is height, as high as its pattern's size
+    suggests. ``height``: height in proportion, see ``image_depth``. ``normal``: the directions of a
+    tangent-space normal map, green up (OpenGL); ``normal_dx``: green down (DirectX); its height
+    follows from it, in proportion. ``auto``: a normal map where the colours are such, else
+    ``photo``; always ``photo`` for methods that compare renders with the picture's tone."""
+    invert: bool = False
+    """Turn a picture's heights over: dark is high, bumps are dents."""
+    image_depth: float | None = None
+    """``kind=height``: how high the full range of the map's values, 0 to 1, is, in shares of the
+    picture's longer side; null is 0.1."""
     image_contrast: float | None = 0.15
     """Image styles: standard deviation that the picture's tone is brought to (it sets the height of
     the relief); null keeps the picture's own contrast."""
@@ -306,6 +317,7 @@ class Config:
 CHOICES: dict[str, tuple[Any, ...]] = {
     "source.refine": ("none", "auto"),
     "style.scale_by": ("area", "frame"),
+    "style.kind": ("auto", "photo", "height", "normal", "normal_dx"),
     "views.spread": ("normal", "around"),
     "field.start": ("map", "source"),
     "views.local.mode": ("image", "zoom", "surface"),
@@ -336,6 +348,7 @@ BETWEEN = {
     "style.scale": (1e-3, 1e3),
     "style.image_tile": (1e-3, 1e3),
     "style.falloff": (0.0, 2.0),
+    "style.image_depth": (1e-4, 10.0),
     "field.features": (1, 65_536),
     "field.width": (1, 65_536),
     "views.count": (1, 4096),
@@ -421,6 +434,12 @@ def _check_placing(config: Config) -> None:
         for key, plain in (("direction", "auto"), ("rotation", 0)):
             if (value := getattr(style, key)) != plain:
                 raise UserError(f"style.{key}={value} needs method=synthesis: no other reads it.")
+    if method is None and (style.invert or style.kind not in ("auto", "photo")):
+        given = "style.invert=true" if style.invert else f"style.kind={style.kind}"
+        raise UserError(
+            f"{given} is about heights, and this method compares renders with the picture's tone: "
+            "add method=synthesis or method=displacement_map."
+        )
     terms = masks.parsed(style.mask)
     if terms and method == "geometric_textures":
         raise UserError(

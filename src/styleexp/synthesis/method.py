@@ -115,7 +115,7 @@ def directions(scene: Subject, sheet: Sheet, directed: bool) -> Float[np.ndarray
 
 
 def exemplar_of_style(scene: Subject) -> MeshExemplar | PictureExemplar:
-    """The style as an example; a picture's tone is its height, as high as ``scene.relief``."""
+    """The style as an example; a picture's heights are ``scene.relief`` high."""
     if isinstance(scene.style, meshes.Mesh):
         return exemplar_of(scene.style)
     tile = height_maps.height_map(scene, height_maps.PATCH)
