@@ -111,10 +111,9 @@ def load(config: Config) -> Subject:
     doing(f"measuring the source ({len(source.faces):,} faces) and the style")
     heights = heights_of(config, style)
     unit = pattern_unit(config.style, source, style if isinstance(style, meshes.Mesh) else None)
-    sigma, bound, height = choose_field(config.field, style, heights)
+    sigma, bound, height = choose_field(config.field, style, heights, config.style.image_tile)
     size = 1.0 if config.style.scale_by == "frame" else unit
     if heights is not None and heights.in_proportion:
-        # As high as the picture is long: not at the pattern's size, which leaves out image_tile.
         height = pictures.spread(heights.height) * height_maps.picture_side(config, unit) / size
         bound = BOUND_MARGIN * height if config.field.bound is None else bound
     if config.source.refine == "auto":
@@ -260,10 +259,14 @@ def pattern_unit(config: StyleConfig, source: meshes.Mesh, style: meshes.Mesh | 
 
 
 def choose_field(
-    config: FieldConfig, style: meshes.Mesh | np.ndarray, heights: Heights | None = None
+    config: FieldConfig,
+    style: meshes.Mesh | np.ndarray,
+    heights: Heights | None = None,
+    tile: float = 1.0,
 ) -> tuple[float, float, float]:
     """sigma, bound and the half range of the relief, in the style's own radii: as configured, or
-    measured on the style, of which a picture comes with its ``heights``."""
+    measured on the style, of which a picture comes with its ``heights`` and how large it lies
+    (``style.image_tile``)."""
     if heights is None:
         assert isinstance(style, meshes.Mesh)
         vertices = meshes.normalisation(style.vertices).apply(style.vertices)
@@ -273,7 +276,7 @@ def choose_field(
         height = min(max(half_range(relief), 0.005), 0.05)
     else:
         small = styles.resized(heights.height, PICTURE_DETAIL)
-        frequency = picture_frequency(small.numpy()) / math.sqrt(4 * math.pi)
+        frequency = picture_frequency(small.numpy()) / (math.sqrt(4 * math.pi) * tile)
         height = PICTURE_STEEPNESS / min(max(frequency, 1.0), 10.0)
     sigma = min(max(frequency, 1.0), 10.0) if config.sigma is None else config.sigma
     bound = BOUND_MARGIN * height if config.bound is None else config.bound
