@@ -314,12 +314,12 @@ def mistaken(config: Config, style: meshes.Mesh | np.ndarray, heights: Heights |
     name = config.style.path or config.style.name
     if heights.in_proportion:
         way = "down (DirectX)" if heights.kind == "normal_dx" else "up (OpenGL)"
-        return [f"'{name}' is read as a normal map, green {way}: style.kind says otherwise"]
+        return [f"'{name}' is read as a normal map, green {way}, as style.kind=auto found"]
     if not is_normal_map(style):
         return []
     return [
         f"'{name}' looks like a normal map: its colours are read as tone, not as directions; "
-        "method=synthesis reads it as one."
+        "method=synthesis and method=displacement_map read it as one."
     ]
 
 
