@@ -236,14 +236,16 @@ def _texture(term: Term, source: Mesh) -> np.ndarray:
 def sampled(
     picture: Float[np.ndarray, "height width"], uv: Float[np.ndarray, "points 2"]
 ) -> Float[np.ndarray, " points"]:
-    """A picture at texture coordinates, bilinear, repeated beyond [0, 1]; row 0 is at v = 1."""
+    """A picture at texture coordinates, bilinear, repeated beyond [0, 1] (but one border
+    does not shine into the other); row 0 is at v = 1."""
     rows, columns = picture.shape
+    uv = np.where((uv >= 0) & (uv <= 1), uv, uv - np.floor(uv))
     y, x = (1 - uv[:, 1]) * rows - 0.5, uv[:, 0] * columns - 0.5
     top, left = np.floor(y).astype(np.int64), np.floor(x).astype(np.int64)
     down, right = y - top, x - left
 
     def at(row: np.ndarray, column: np.ndarray) -> np.ndarray:
-        return picture[row % rows, column % columns].astype(np.float64)
+        return picture[row.clip(0, rows - 1), column.clip(0, columns - 1)].astype(np.float64)
 
     upper = (1 - right) * at(top, left) + right * at(top, left + 1)
     lower = (1 - right) * at(top + 1, left) + right * at(top + 1, left + 1)
