@@ -191,9 +191,12 @@ def test_displacement_map_of_a_picture_raises_what_is_bright():
     ramp[:32] = 1.0
     from dataclasses import replace
 
+    from styleexp.pictures import picture_height
+
     config = compose(["source=sphere", "style=bubble", "method=displacement_map"])
     method = baselines.method(config)
-    scene = replace(method.prepare(config), style=ramp)
+    heights = picture_height(config, ramp)
+    scene = replace(method.prepare(config), style=ramp, heights=heights)
     result = method.finish(scene, None)
     half = scene.unit * math.sqrt(4 * math.pi) / 2  # y = 0 is the tile's top, bright, border
     assert half > 1

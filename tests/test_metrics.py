@@ -11,7 +11,7 @@ from PIL import Image
 from styleexp import meshes, metrics, shapes
 from styleexp.cli.metrics import main
 from styleexp.compose import compose
-from styleexp.config import StyleConfig
+from styleexp.config import Config
 from styleexp.metrics import patches, shape, style, truth
 from styleexp.metrics.board import nearest
 from styleexp.scene import pattern_unit
@@ -123,7 +123,7 @@ def test_a_pictures_brightness_stands_for_a_relief_of_any_height(judge):
     seen = patches.windows(reliefs[0], 1.0, 4).height[0].numpy()
     bright = (seen - seen.min()) / (seen.max() - seen.min())
     picture = np.repeat(bright[..., None], 3, axis=2).astype(np.float32)
-    goal = style.judged_picture(picture, StyleConfig(), 1.0, judge.encoder)
+    goal = style.judged_picture(picture, Config(), 1.0, judge.encoder)
     low = replace(reliefs[0], height=0.3 * reliefs[0].height)
     near, other, lower = (
         style.relief_distance(style.judged(each, 1.0, judge.encoder, 12), goal)

@@ -84,10 +84,27 @@ def test_what_only_the_files_own_format_holds_is_named(tmp_path):
     ball.export(tmp_path / "ball.glb")
     fine = meshes.refine(meshes.load_mesh(tmp_path / "ball.glb"), 0.2)
     assert "glTF" in fine.repairs[-1]
-    ball.vertex_attributes["quality"] = np.arange(len(ball.vertices), dtype=np.float32)
+    ball.face_attributes["quality"] = np.arange(len(ball.faces), dtype=np.float32)
     ball.export(tmp_path / "ball.ply")
     fine = meshes.refine(meshes.load_mesh(tmp_path / "ball.ply"), 0.2)
-    assert "PLY file's own properties" in fine.repairs[-1]
+    assert fine.repairs[-1].endswith("without face properties (quality)")
+
+
+def test_a_plys_numbers_and_vectors_are_carried_over_and_saved(tmp_path):
+    ball = trimesh.creation.icosphere(1)
+    ball.vertex_attributes["quality"] = ball.vertices[:, 1].astype(np.float32)
+    ball.vertex_attributes["way"] = ball.vertices.astype(np.float32)
+    ball.export(tmp_path / "ball.ply")
+    mesh = meshes.load_mesh(tmp_path / "ball.ply")
+    fine = meshes.refine(mesh, 0.2)
+    assert not fine.repairs[-1].endswith(")")
+    for end in (".ply", ".glb"):
+        meshes.save_mesh(fine, fine.vertices, tmp_path / f"fine{end}")
+        read = meshes.load_mesh(tmp_path / f"fine{end}").carrier.attributes
+        number, vector = sorted(read.values(), key=lambda values: values.shape[1])
+        assert {name.lower() for name in read} == {"quality", "way"}
+        assert number.shape == (len(fine.vertices), 1)
+        assert np.abs(number[:, 0] - vector[:, 1]).max() < 1e-6  # both are linear along edges
 
 
 def test_too_many_faces_are_refused(monkeypatch):

@@ -250,7 +250,7 @@ def test_strength_zero_gives_the_source_back_and_no_face_turns_over(striped):
     ("style", "options", "told"),
     [
         ("sphere", (), "has no relief to speak of"),
-        ("bubble", ("baseline.direction=north",), "baseline.direction=north is not allowed"),
+        ("bubble", ("style.direction=north",), "style.direction=north is not allowed"),
         ("bubble", ("baseline.bank=3",), "baseline.bank=3 is not allowed"),
     ],
 )

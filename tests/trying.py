@@ -81,7 +81,7 @@ def outcome(case: Case, folder: Path, shared: Path) -> tuple[str, str, Any]:
             return REFUSED, str(error), None
     told = [str(w.message) for w in caught if issubclass(w.category, UserWarning)]
     repairs = [*scene.source.repairs, *getattr(scene.style, "repairs", ())]
-    stated = [*repairs, *(t for t in told if case.name in t)]
+    stated = [*repairs, *(t for t in [*told, *scene.notes] if case.name in t)]
     for repair in repairs:  # the user is told
         assert any(repair in note for note in scene.notes), repair
     return (REPAIRED if stated else WORKS), " | ".join(stated), result

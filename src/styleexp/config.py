@@ -49,6 +49,34 @@ class StyleConfig:
     """What ``scale`` 1 means. ``area``: the result carries as many features as the style mesh, as
     lengths go by the square root of the surface; ``field.sigma`` and ``field.bound`` then go with
     the pattern, too. ``frame``: both meshes fill the unit sphere, as in the paper."""
+    direction: str = "auto"
+    """Which way the pattern's up points (``method=synthesis``). ``up``, ``x``, ``y``, ``z``: along
+    that axis wherever the surface allows it (``up`` is ``y``). ``flow``: smoothly along the form.
+    ``attribute:NAME``: along a vector that the source's file has for each vertex, as far as it lies
+    in the surface. ``auto``: ``up`` for a style with a direction, ``flow`` for one without."""
+    rotation: float = 0.0
+    """Degrees by which the pattern is turned against that, counter-clockwise seen from outside."""
+    mask: Any = None
+    """Where the relief goes; null is everywhere. One of these, or a list of them, multiplied:
+    ``attribute:NAME`` (a number in [0, 1] that the source's file has for each vertex),
+    ``color:CHANNEL`` (of the vertex colours: r, g, b, a or luminance), ``texture:FILE`` (a
+    picture's luminance through the source's texture coordinates, row 0 at the top, repeated),
+    ``slope:DEGREES`` (where the normal is within so many of up, +Y), ``height:LOW..HIGH`` (in
+    shares of the source's height along +Y). ``not:`` in front of one takes the rest."""
+    falloff: float = 0.05
+    """Width of the mask's borders, in radii of the normalised source; half of it lies on each
+    side. 0 leaves the mask as it is."""
+    kind: str = "auto"
+    """What a picture's colours are. ``photo``: its tone is height, as high as its pattern's size
+    suggests. ``height``: height in proportion, see ``image_depth``. ``normal``: the directions of a
+    tangent-space normal map, green up (OpenGL); ``normal_dx``: green down (DirectX); its height
+    follows from it, in proportion. ``auto``: a normal map where the colours are such, else
+    ``photo``; always ``photo`` for methods that compare renders with the picture's tone."""
+    invert: bool = False
+    """Turn a picture's heights over: dark is high, bumps are dents."""
+    image_depth: float | None = None
+    """``kind=height``: how high the full range of the map's values, 0 to 1, is, in shares of the
+    picture's longer side; null is 0.1."""
     image_contrast: float | None = 0.15
     """Image styles: standard deviation that the picture's tone is brought to (it sets the height of
     the relief); null keeps the picture's own contrast."""
@@ -289,6 +317,7 @@ class Config:
 CHOICES: dict[str, tuple[Any, ...]] = {
     "source.refine": ("none", "auto"),
     "style.scale_by": ("area", "frame"),
+    "style.kind": ("auto", "photo", "height", "normal", "normal_dx"),
     "views.spread": ("normal", "around"),
     "field.start": ("map", "source"),
     "views.local.mode": ("image", "zoom", "surface"),
@@ -318,6 +347,8 @@ BETWEEN = {
     "source.remesh": (100, 10_000_000),
     "style.scale": (1e-3, 1e3),
     "style.image_tile": (1e-3, 1e3),
+    "style.falloff": (0.0, 2.0),
+    "style.image_depth": (1e-4, 10.0),
     "field.features": (1, 65_536),
     "field.width": (1, 65_536),
     "views.count": (1, 4096),
@@ -365,6 +396,7 @@ def check(config: Config) -> None:
         value = _value(config, key)
         if value is not None and not low <= value <= high:
             raise UserError(f"{key}={value} is not allowed: give a value from {low} to {high}.")
+    _check_placing(config)
     if len(config.loss.block_weights) != 5 or min(config.loss.block_weights) < 0:
         raise UserError(
             f"loss.block_weights={config.loss.block_weights} is not allowed: give five weights, "
@@ -381,6 +413,46 @@ def check(config: Config) -> None:
                 f"shading.background={background} is not allowed: give white, black, foreground or "
                 "a grey from 0 to 1."
             )
+
+
+DIRECTIONS = ("auto", "up", "flow", "x", "y", "z")
+"""Of ``style.direction``, besides ``attribute:NAME``."""
+
+
+def _check_placing(config: Config) -> None:
+    """The same for where the relief goes, and which way."""
+    from styleexp import masks
+
+    style, method = config.style, getattr(config.baseline, "name", None)
+    named = style.direction.partition("attribute:")
+    if style.direction not in DIRECTIONS and not (named[0] == "" and named[2]):
+        raise UserError(
+            f"style.direction={style.direction} is not allowed: give {', '.join(DIRECTIONS)} or "
+            "attribute:NAME."
+        )
+    if method in (None, "displacement_map", "geometric_textures"):
+        for key, plain in (("direction", "auto"), ("rotation", 0)):
+            if (value := getattr(style, key)) != plain:
+                raise UserError(f"style.{key}={value} needs method=synthesis: no other reads it.")
+    if method is None and (style.invert or style.kind not in ("auto", "photo")):
+        given = "style.invert=true" if style.invert else f"style.kind={style.kind}"
+        raise UserError(
+            f"{given} is about heights, and this method compares renders with the picture's tone: "
+            "add method=synthesis or method=displacement_map."
+        )
+    terms = masks.parsed(style.mask)
+    if terms and method == "geometric_textures":
+        raise UserError(
+            "method=geometric_textures gives the result faces of its own, and style.mask is of the "
+            "source's vertices: choose another method, or leave style.mask out."
+        )
+    lost = [f"style.mask={term.text}" for term in terms if term.kind in masks.OF_THE_FILE]
+    lost += [f"style.direction={style.direction}"] if named[1] else []
+    if lost and config.source.remesh:
+        raise UserError(
+            f"{lost[0]} is lost with source.remesh, which keeps no attributes, colours or texture "
+            "coordinates: use source.refine=auto instead."
+        )
 
 
 def _numbers(part: Any, prefix: str = "") -> Iterator[tuple[str, float]]:

@@ -1,9 +1,9 @@
 """The style as a height map laid on the source by triplanar projection.
 
-The map is a picture's tone, or a patch of the style mesh's own relief. It is projected along the
-three axes, tiled by mirroring, and the three heights are blended by the components of the vertex
-normal. No view is rendered, nothing is learned: what a technical artist would do, in an instant. It
-is where the field starts (`field.start`), and a baseline.
+The map is a picture's heights (`styleexp.pictures`), or a patch of the style mesh's own relief. It
+is projected along the three axes, tiled by mirroring, and the three heights are blended by the
+components of the vertex normal. No view is rendered, nothing is learned: what a technical artist
+would do, in an instant. It is where the field starts (`field.start`), and a baseline.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from styleexp import meshes, shapes, styles
+from styleexp import meshes, pictures, shapes, styles
 from styleexp.errors import UserError
 from styleexp.fields import zero_mean
-from styleexp.images import luminance
 from styleexp.relief import half_range, mesh_relief
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from torch import Tensor
 
+    from styleexp.config import Config
     from styleexp.scene import Subject
 
 AXES = ((2, 1), (0, 2), (0, 1))
@@ -53,7 +53,8 @@ class NoPatch(UserError):
 
 @dataclass(frozen=True)
 class HeightMap:
-    """One tile, row 0 at the top, its mean 0, its half range 1."""
+    """One tile, row 0 at the top, its mean 0, its half range 1 (of a picture whose heights are in
+    proportion before detail was filtered out)."""
 
     height: Float[Tensor, "rows columns"]
     side: float
@@ -64,30 +65,41 @@ def displacement(
     scene: Subject, height: float | None = None, patch: float = PATCH, sharpness: float = SHARPNESS
 ) -> Float[Tensor, " vertices"]:
     """The style's height map as a displacement of the source's vertices, zero on average over the
-    surface, in radii of the normalised source.
+    surface (where there is a mask, over what it selects), in radii of the normalised source. The
+    mask is not applied yet.
 
     ``height`` is half its range; the style's own relief's where none is given.
     """
     tile, surface = height_map(scene, patch), scene.surface
     raised = triplanar(tile, surface.vertices, surface.normals, sharpness)
     height = scene.relief if height is None else height
-    return zero_mean(height * raised, scene.areas, math.inf)
+    return zero_mean(height * raised, scene.weights, math.inf)
 
 
 def height_map(scene: Subject, patch: float) -> HeightMap:
     """The style as a height map of the size that ``style.scale`` and ``style.image_tile`` say."""
     style, device = scene.style, scene.surface.vertices.device
-    if isinstance(style, meshes.Mesh):
+    heights = scene.heights
+    if heights is not None:
+        height = heights.height.to(device)
+        side = picture_side(scene.config, scene.unit)
+    else:
+        assert isinstance(style, meshes.Mesh)
         height = torch.from_numpy(mesh_patch(style, patch)).to(device)
         side = patch * math.sqrt(2) * scene.unit
-    else:
-        height = luminance(torch.from_numpy(style).to(device))
-        side = scene.unit * scene.config.style.image_tile * math.sqrt(4 * math.pi)
     # Detail finer than the source's edges would come out as noise.
     edge = meshes.mean_edge_length(scene.source.vertices, scene.source.faces) / scene.frame.scale
-    height = styles.resized(height, min(side / edge, max(height.shape)))
-    spread = max(half_range(height.cpu().numpy().ravel()), 1e-6)
-    return HeightMap((height - height.mean()) / spread, side)
+    fit = styles.resized(height, min(side / edge, max(height.shape)))
+    if heights is not None and heights.in_proportion:
+        half = pictures.spread(heights.height)  # of the whole: what was filtered out stays lost
+    else:
+        half = max(half_range(fit.cpu().numpy().ravel()), 1e-6)
+    return HeightMap((fit - fit.mean()) / half, side)
+
+
+def picture_side(config: Config, unit: float) -> float:
+    """Length of a style picture's longer side on the result, in radii of the normalised source."""
+    return unit * config.style.image_tile * math.sqrt(4 * math.pi)
 
 
 def mesh_patch(style: meshes.Mesh, radius: float) -> Float[np.ndarray, "side side"]:

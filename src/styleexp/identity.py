@@ -10,7 +10,7 @@ import hashlib
 import json
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +20,16 @@ if TYPE_CHECKING:
 
 FILES = ("source", "style")
 """Parts of the configuration that may name a file."""
+
+
+@dataclass(frozen=True)
+class Named:
+    """What may be a file of a run: `FILES`, or a picture of ``style.mask``."""
+
+    name: str | None
+    path: str | None
+
+
 ABSENT = "not found"
 """In the place of a file's sha256."""
 
@@ -38,14 +48,24 @@ def job_key(config: Config) -> str:
     from styleexp.errors import UserError
 
     files = {}
-    for kind in FILES:
-        part = getattr(config, kind)
+    for kind, part in parts(config).items():
         try:
             path = sources.locate(kind, part.name, part.path)
             files[kind] = sha256(path) if path else None
         except UserError:  # the run will say so
             files[kind] = ABSENT
     return _hash(asdict(config), files, __version__)
+
+
+def parts(config: Config) -> dict[str, Named]:
+    """All of a run that may be a file, by the words for it: ``source``, ``style`` and, as often as
+    ``style.mask`` has a picture, ``mask``, ``mask 2`` and so on."""
+    from styleexp import masks
+
+    found = {kind: Named(getattr(config, kind).name, getattr(config, kind).path) for kind in FILES}
+    for k, path in enumerate(masks.files(config.style.mask), 1):
+        found["mask" if k == 1 else f"mask {k}"] = Named(None, path)
+    return found
 
 
 def of(record: Mapping[str, Any]) -> str | None:

@@ -31,8 +31,7 @@ def load_image(path: str | Path, *, background: float = 1.0) -> Float[np.ndarray
     PNG, JPEG, WebP, TIFF and others (:data:`FORMATS`): colour, grey, palette, CMYK, with and
     without opacity; PNG and TIFF with all of their 16 bits (scaled by 65535), TIFF of half, single
     and double precision within [0, 1]. The EXIF rotation is applied, an animation gives its first
-    frame. Values are as stored (sRGB-coded); colour profiles are not applied. A warning tells where
-    a picture looks like a normal map, whose colours are directions and no tone.
+    frame. Values are as stored (sRGB-coded); colour profiles are not applied.
 
     Args:
         path: the file. Its name does not matter, its content does.
@@ -68,7 +67,7 @@ def load_image(path: str | Path, *, background: float = 1.0) -> Float[np.ndarray
             if deep is not None:
                 pixels, frames = deep
                 _one_of(frames, path)
-                return _told(pixels, path)
+                return pixels
             with Image.open(path, formats=readable) as image:
                 if min(image.size) < MIN_SIDE:
                     raise UserError(
@@ -99,7 +98,7 @@ def load_image(path: str | Path, *, background: float = 1.0) -> Float[np.ndarray
         raise UserError(
             f"the image '{path}' is damaged or cut short and cannot be decoded ({reason})."
         ) from error
-    return _told(pixels, path)
+    return pixels
 
 
 def is_normal_map(rgb: Float[np.ndarray, "height width 3"]) -> bool:
@@ -113,16 +112,6 @@ def is_normal_map(rgb: Float[np.ndarray, "height width 3"]) -> bool:
     x, y, z = normals.mean(axis=0)
     upward = (normals[:, 2] > 0).mean() > 0.99
     return bool(unit.mean() > 0.95 and upward and z > 0.6 and max(abs(x), abs(y)) < 0.2)
-
-
-def _told(pixels: np.ndarray, path: Path) -> np.ndarray:
-    if is_normal_map(pixels):
-        warnings.warn(
-            f"'{path}' looks like a normal map: its colours are read as tone, not as directions; a "
-            "height map or a photograph of the material serves better.",
-            stacklevel=3,
-        )
-    return pixels
 
 
 def from_array(picture: np.ndarray) -> Float[np.ndarray, "height width 3"]:

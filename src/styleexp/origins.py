@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 
 def describe(config: Config) -> dict[str, dict[str, str | None]]:
-    """Name, absolute path and sha256 of the source and style, for the run's record; analytic shapes
-    have no file, their definition is this version's. Raises `UserError` for what isn't there."""
+    """Name, absolute path and sha256 of the source, the style and the mask's pictures, by
+    `identity.parts`, for the run's record; analytic shapes have no file, their definition is this
+    version's. Raises `UserError` for what isn't there."""
     found = {}
-    for kind in identity.FILES:
-        part = getattr(config, kind)
+    for kind, part in identity.parts(config).items():
         path = sources.locate(kind, part.name, part.path)
         digest = identity.sha256(path) if path else None
         if digest == identity.ABSENT:
@@ -69,16 +69,20 @@ def restored(
     ``tell`` takes notes for the user; by default they are printed to standard error. Raises
     `UserError` for a file that has changed or is gone, and what `compose.recorded` raises.
     """
-    from styleexp import compose
+    from styleexp import compose, masks
 
     config = compose.recorded(record.get("config"))
-    for kind in identity.FILES:
+    pictures = []
+    for kind in identity.parts(config):
         try:
             path = find(record, config, kind, folder, tell)
         except UserError as error:
             raise UserError(f"cannot {purpose} '{folder}': {error}") from None
-        if path is not None:
+        if path is not None and kind in identity.FILES:
             getattr(config, kind).path = str(path)
+        elif path is not None:
+            pictures.append(str(path))
+    config.style.mask = masks.with_files(config.style.mask, pictures)
     return config
 
 
@@ -93,7 +97,7 @@ def find(
 
     Raises `UserError`, with the end of a sentence, for a file that has changed or is gone.
     """
-    part = getattr(config, kind)
+    part = identity.parts(config)[kind]
     told = (record.get("assets") or {}).get(kind) or {}
     digest = told.get("sha256")
     if digest is None:

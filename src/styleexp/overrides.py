@@ -139,6 +139,8 @@ def _quoted(override: str, multirun: bool) -> str:
         return override
     if plain in PARTS:
         return _part(plain, value, multirun)
+    if plain == "style.mask":
+        return f"{key}={_masks(value, multirun)}"
     if plain.rsplit(".", 1)[-1] in FILES and "." in plain:
         return f"{key}={_files(plain, value, multirun)}"
     return override
@@ -169,6 +171,15 @@ def _files(key: str, value: str, multirun: bool) -> str:
     if not multirun and len(parts) > 1 and not exists(value) and all(map(exists, parts)):
         raise UserError(f"{key}={value} names {len(parts)} files: add -m to take each in turn.")
     return value if multirun and FUNCTION.fullmatch(value) else _file(value)
+
+
+def _masks(value: str, multirun: bool) -> str:
+    """The value of ``style.mask`` in Hydra's grammar: a list is already, one mask may hold the name
+    of a file."""
+    if value[:1] in ("[", "") or FUNCTION.fullmatch(value):
+        return value
+    each = _split(value) if multirun else [value]
+    return ",".join(map(_file, each))
 
 
 def _file(value: str) -> str:

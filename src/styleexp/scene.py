@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from styleexp import height_maps, meshes, remembered, styles
+from styleexp import height_maps, masks, meshes, pictures, remembered, styles
 from styleexp.config import check
 from styleexp.errors import UserError
 from styleexp.geometry import Surface, vertex_areas
-from styleexp.images import luminance
+from styleexp.images import is_normal_map
+from styleexp.pictures import Heights
 from styleexp.plugins import build
 from styleexp.relief import half_range, mesh_frequency, mesh_relief, picture_frequency
 from styleexp.renderers.base import Shading
@@ -51,8 +52,6 @@ PER_WAVE = 10.0
 """Of the longest edges, on a wavelength of the style's relief, where the source is refined."""
 MOST_REFINED = 250_000
 """Faces that refining aims at, at most."""
-LEAST_CONTRAST = 1e-3
-"""Standard deviation of a picture's tone, of 1, below which it is rounding alone."""
 STRAY = 5.0
 """A mesh has stray faces where a vertex is so many times farther off than 99 of 100 vertices."""
 
@@ -76,8 +75,17 @@ class Subject:
     """Displacements lie in (-bound, bound), in radii of the normalised source."""
     relief: float
     """Half the range of the style's own relief, in such radii."""
+    heights: Heights | None = None
+    """Of a picture; None for a mesh."""
+    mask: Float[Tensor, " vertices"] | None = None
+    """Factor on the displacement, 0 to 1 (``style.mask``); None is 1 everywhere."""
     notes: tuple[str, ...] = ()
     """What the user should know: repairs, a mesh too coarse for the style."""
+
+    @property
+    def weights(self) -> Float[Tensor, " vertices"]:
+        """The area that each vertex counts for in means over the surface that gets relief."""
+        return self.areas if self.mask is None else self.areas * self.mask
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,26 +106,30 @@ def load(config: Config) -> Subject:
     check(config)
     device = choose_device(config.device)
     source = load_source(config.source)
+    masks.check(config.style, source)
     style = load_style(config.style)
     doing(f"measuring the source ({len(source.faces):,} faces) and the style")
-    if isinstance(style, np.ndarray) and luminance(style).std() < LEAST_CONTRAST:
-        raise UserError(
-            f"the style '{config.style.path or config.style.name}' is a picture of one tone, there "
-            "is nothing to transfer: give one with contrast."
-        )
+    heights = heights_of(config, style)
     unit = pattern_unit(config.style, source, style if isinstance(style, meshes.Mesh) else None)
-    sigma, bound, height = choose_field(config.field, style)
+    sigma, bound, height = choose_field(config.field, style, heights, config.style.image_tile)
     size = 1.0 if config.style.scale_by == "frame" else unit
+    if heights is not None and heights.in_proportion:
+        height = pictures.spread(heights.height) * height_maps.picture_side(config, unit) / size
+        bound = BOUND_MARGIN * height if config.field.bound is None else bound
     if config.source.refine == "auto":
         source = refined(source, size / sigma)
     frame, surface = normalised(source, device)
+    areas = vertex_areas(surface)
+    mask, told = placed(config.style, source, areas)
     return Subject(
         config=config,
         source=source,
         style=style,
+        heights=heights,
         frame=frame,
         surface=surface,
-        areas=vertex_areas(surface),
+        areas=areas,
+        mask=mask,
         unit=unit,
         sigma=sigma / size,
         bound=bound * size,
@@ -128,8 +140,35 @@ def load(config: Config) -> Subject:
             *stray_faces("source", source),
             *(stray_faces("style", style) if isinstance(style, meshes.Mesh) else ()),
             *too_coarse(source, size / sigma),
+            *told,
+            *mistaken(config, style, heights),
         ),
     )
+
+
+def heights_of(config: Config, style: meshes.Mesh | np.ndarray) -> Heights | None:
+    """A picture's heights; None for a mesh, of which the keys that say how to read pictures, where
+    they are given, are refused."""
+    if isinstance(style, np.ndarray):
+        return pictures.picture_height(config, style)
+    for key, plain in (("kind", "auto"), ("invert", False), ("image_depth", None)):
+        if (value := getattr(config.style, key)) != plain:
+            raise UserError(
+                f"style.{key}={str(value).lower()} says how to read a picture, and the style "
+                f"'{style.name}' is a mesh: leave it out."
+            )
+    return None
+
+
+def placed(
+    config: StyleConfig, source: meshes.Mesh, areas: Float[Tensor, " vertices"]
+) -> tuple[Float[Tensor, " vertices"] | None, list[str]]:
+    """``style.mask`` at the source's vertices, and a note on how much of the surface it selects."""
+    if config.mask is None:
+        return None, []
+    mask = torch.from_numpy(masks.weights(config, source)).to(areas)
+    share = float((areas * mask).sum() / areas.sum())
+    return mask, [f"the relief goes on {100 * share:.1f} % of the surface (style.mask)"]
 
 
 def prepare(config: Config) -> Scene:
@@ -220,19 +259,24 @@ def pattern_unit(config: StyleConfig, source: meshes.Mesh, style: meshes.Mesh | 
 
 
 def choose_field(
-    config: FieldConfig, style: meshes.Mesh | np.ndarray
+    config: FieldConfig,
+    style: meshes.Mesh | np.ndarray,
+    heights: Heights | None = None,
+    tile: float = 1.0,
 ) -> tuple[float, float, float]:
     """sigma, bound and the half range of the relief, in the style's own radii: as configured, or
-    measured on the style."""
-    if isinstance(style, meshes.Mesh):
+    measured on the style, of which a picture comes with its ``heights`` and how large it lies
+    (``style.image_tile``)."""
+    if heights is None:
+        assert isinstance(style, meshes.Mesh)
         vertices = meshes.normalisation(style.vertices).apply(style.vertices)
         normals = meshes.vertex_normals(vertices, style.faces)
         relief = mesh_relief(vertices, style.faces, normals, length=0.5)
         frequency = mesh_frequency(relief, vertices, style.faces)
         height = min(max(half_range(relief), 0.005), 0.05)
     else:
-        small = styles.resized(torch.from_numpy(style).mean(-1), PICTURE_DETAIL)
-        frequency = picture_frequency(small.numpy()) / math.sqrt(4 * math.pi)
+        small = styles.resized(heights.height, PICTURE_DETAIL)
+        frequency = picture_frequency(small.numpy()) / (math.sqrt(4 * math.pi) * tile)
         height = PICTURE_STEEPNESS / min(max(frequency, 1.0), 10.0)
     sigma = min(max(frequency, 1.0), 10.0) if config.sigma is None else config.sigma
     bound = BOUND_MARGIN * height if config.bound is None else config.bound
@@ -260,6 +304,22 @@ def too_coarse(mesh: meshes.Mesh, wavelength: float) -> list[str]:
     return [
         f"'{mesh.name}' is coarse for this style: its edges are {edge:.3f} radii long, the style's "
         f"details about {wavelength:.3f}; add source.refine=auto, which keeps texture coordinates."
+    ]
+
+
+def mistaken(config: Config, style: meshes.Mesh | np.ndarray, heights: Heights | None) -> list[str]:
+    """A note on a normal map whose colours are read as tone, because the method can't do else."""
+    if heights is None or isinstance(style, meshes.Mesh) or config.style.kind != "auto":
+        return []
+    name = config.style.path or config.style.name
+    if heights.in_proportion:
+        way = "down (DirectX)" if heights.kind == "normal_dx" else "up (OpenGL)"
+        return [f"'{name}' is read as a normal map, green {way}, as style.kind=auto found"]
+    if not is_normal_map(style):
+        return []
+    return [
+        f"'{name}' looks like a normal map: its colours are read as tone, not as directions; "
+        "method=synthesis and method=displacement_map read it as one."
     ]
 
 

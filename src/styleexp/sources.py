@@ -9,7 +9,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from styleexp import assets, images, meshes, plugins, shapes
+from styleexp import assets, identity, images, meshes, plugins, shapes
 from styleexp.errors import UserError, unknown_name
 from styleexp.stages import doing
 
@@ -47,11 +47,12 @@ def given(**parts: meshes.Mesh | np.ndarray) -> Iterator[None]:
 
 
 def check(config: Config) -> None:
-    """Raise `UserError` where a source's or style's file isn't there or is of no readable kind.
+    """Raise `UserError` where a source's, style's or mask's file isn't there or is of no readable
+    kind.
 
     Reads nothing, loads nothing heavy: a mistyped name is told at once.
     """
-    for kind, part in (("source", config.source), ("style", config.style)):
+    for kind, part in identity.parts(config).items():
         path = locate(kind, part.name, part.path)
         if path is None:
             continue

@@ -27,6 +27,7 @@ from styleexp.errors import UserError
 from styleexp.explain import explain
 from styleexp.fields import zero_mean
 from styleexp.geometry import unfolded
+from styleexp.masks import masked
 from styleexp.overrides import is_file
 from styleexp.scene import Scene, Subject
 from styleexp.scene import prepare as prepare  # this module is a `baselines.Method`
@@ -306,7 +307,8 @@ def displace(
     scene: Scene, state: State, precision: torch.dtype | None = None
 ) -> Float[Tensor, " vertices"]:
     """The displacement d of every vertex, in radii of the normalised source: the field's, on top of
-    ``scene.base`` where there is one (``field.start``; the paper has none)."""
+    ``scene.base`` where there is one (``field.start``; the paper has none), within ``scene.mask``.
+    """
     config = scene.config.field
     if precision is None:
         precision = torch.bfloat16 if scene.loss.encoder.precision == "bf16" else torch.float32
@@ -317,8 +319,8 @@ def displace(
     if scene.base is not None:
         displacement = (scene.base + displacement).clamp(-scene.bound, scene.bound)
     if config.zero_mean:
-        displacement = zero_mean(displacement, scene.areas, scene.bound)
-    return displacement
+        displacement = zero_mean(displacement, scene.weights, scene.bound)
+    return masked(displacement, scene.mask)
 
 
 def finish(scene: Scene, state: State) -> Result:

@@ -40,8 +40,8 @@ class Method(Protocol):
         ...
 
     def finish(self, scene: Any, state: Any) -> Result:
-        """The generated mesh. Where it has other faces than the source, the result's ``scene`` has
-        a source that has them too, in the same frame."""
+        """The generated mesh; where ``scene.mask`` is 0, the source. Where it has other faces than
+        the source, the result's ``scene`` has a source that has them too, in the same frame."""
         ...
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from styleexp.errors import UserError
 from styleexp.height_maps import displacement
+from styleexp.masks import masked
 from styleexp.scene import load
 from styleexp.stylize import Result, Step
 
@@ -43,6 +44,7 @@ class DisplacementMap:
         """Displace the source by the map; zero on average over the surface."""
         options = self.config
         raised = displacement(scene, options.height, options.patch, options.sharpness).double()
+        raised = masked(raised, scene.mask)
         moved = raised.cpu().numpy() * scene.config.strength * scene.frame.scale
         offset = moved[:, None] * scene.surface.normals.double().cpu().numpy()
         return Result(scene, moved, scene.source.vertices + offset)

@@ -30,12 +30,6 @@ class SynthesisConfig:
     """The style's relief laid on by example; see docs/synthesis.md."""
 
     name: str = "synthesis"
-    direction: str = "auto"
-    """Which way the pattern's up points. ``up``, ``x``, ``y``, ``z``: along that axis wherever the
-    surface allows it (``up`` is ``y``). ``flow``: smoothly along the form. ``auto``: ``up`` for a
-    style with a direction, ``flow`` for one without."""
-    rotation: float = 0.0
-    """Degrees by which the pattern is turned against that, counter-clockwise seen from outside."""
     bank: int = 10_000
     """Patches that are taken of the style at each scale."""
 

@@ -30,6 +30,8 @@ from styleexp.meshes.welding import check_indices, plural
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
+DISPLACEMENT = "_DISPLACEMENT"
+"""The custom attribute of a result, which the next run's result has anew."""
 TRIANGLES, STRIP, FAN = 4, 5, 6
 EARLY = "ends too early: copy or export the mesh again."
 DRACO = "KHR_draco_mesh_compression"
@@ -188,6 +190,13 @@ class _Reader:
         ):
             if name in attributes and len(used):
                 columns[column] = self._column(attributes[name], count, width)[used]
+        for name, accessor in attributes.items():
+            if name.startswith("_") and name != DISPLACEMENT and len(used):
+                values = accessors.real(self.tree, self.buffers, accessor)
+                values = self._column(accessor, count, values.shape[1])[used]
+                if values.shape[1] == 3:
+                    values = turned(matrix[..., :3, :3].swapaxes(-1, -2), values)
+                columns[name] = values
         if "normals" in columns:
             columns["normals"] = turned(np.linalg.pinv(matrix[..., :3, :3]), columns["normals"])
         # A mirrored node winds the other way (glTF 2.0, 3.7.4).
@@ -294,8 +303,23 @@ class _Reader:
             face_part=np.repeat(part, number),
             materials=chosen,
             face_material=face_material,
+            attributes=self._attributes(),
             document=Document(self.tree, self.buffers, tuple(self.blocks), materials.beside),
         )
+
+    def _attributes(self) -> dict[str, np.ndarray]:
+        """The columns of custom attributes, 0 where a block lacks one; not those whose width is
+        another from block to block."""
+        widths: dict[str, set[int]] = {}
+        for columns in self.columns:
+            for name in filter(lambda name: name.startswith("_"), columns):
+                widths.setdefault(name, set()).add(columns[name].shape[1])
+        found = {}
+        for name, given in widths.items():
+            values = self._joined(name, np.zeros(min(given))) if len(given) == 1 else None
+            if values is not None:
+                found[name[1:]] = values
+        return found
 
     def _joined(self, name: str, filler: np.ndarray) -> np.ndarray | None:
         """A column of all rows, filled where a block has none; None if no block has it."""

@@ -62,12 +62,11 @@ def new_glb(
 
 
 def _own(carrier: Carrier) -> dict[str, np.ndarray]:
-    """A PLY file's own numbers of the vertices, under names that glTF allows."""
-    own = () if carrier.ply is None else carrier.ply.own
+    """The vertices' own numbers and vectors, under names that glTF allows."""
     return {
-        "_" + re.sub(r"\W", "_", name).upper(): carrier.ply.vertex[name]
-        for name in own
-        if isinstance(carrier.ply.vertex[name], np.ndarray)
+        "_" + re.sub(r"\W", "_", name).upper(): values
+        for name, values in carrier.attributes.items()
+        if values.shape[1] in TYPES
     }
 
 

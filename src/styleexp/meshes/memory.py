@@ -10,6 +10,7 @@ import numpy as np
 from styleexp import images
 from styleexp.errors import UserError
 from styleexp.meshes.mesh import Carrier, Mesh
+from styleexp.meshes.ply_meshes import DISPLACEMENT
 from styleexp.meshes.precision import of_floats
 from styleexp.meshes.welding import check_indices, weld
 
@@ -32,7 +33,12 @@ def from_memory(given: Any, kind: str) -> Mesh | Float[np.ndarray, "height width
         if isinstance(given, tuple | list) and len(given) == 2:
             return from_arrays(*given)
         if hasattr(given, "vertices") and hasattr(given, "faces"):
-            return from_arrays(given.vertices, given.faces, getattr(given, "visual", None))
+            return from_arrays(
+                given.vertices,
+                given.faces,
+                getattr(given, "visual", None),
+                getattr(given, "vertex_attributes", None),
+            )
     except UserError as error:
         raise UserError(f"the {kind} {error}") from None
     raise UserError(
@@ -42,10 +48,14 @@ def from_memory(given: Any, kind: str) -> Mesh | Float[np.ndarray, "height width
 
 
 def from_arrays(
-    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], visual: Any = None
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    visual: Any = None,
+    attributes: Any = None,
 ) -> Mesh:
     """A checked, welded, outward mesh, named ``array``; see `load_mesh`. Of a trimesh's ``visual``
-    texture coordinates, the material and the vertices' colours are kept.
+    texture coordinates, the material and the vertices' colours are kept, and its ``attributes``,
+    arrays (vertices,) or (vertices, width) of numbers by their names.
 
     Raises `UserError` with the end of a sentence that begins with whose arrays they are.
     """
@@ -76,6 +86,12 @@ def from_arrays(
     carrier = Carrier(corners, no_row, np.zeros(len(corners), dtype=bool), precision=rounding)
     if visual is not None:
         carrier = replace(carrier, **_looks(visual, used, len(corners), notes))
+    kept = {}
+    for name, values in {k: np.asarray(v) for k, v in (attributes or {}).items()}.items():
+        fits = values.dtype.kind in "buif" and values.shape[:1] == points.shape[:1] and values.size
+        if fits and name != DISPLACEMENT:
+            kept[name] = values.astype(np.float64).reshape(len(points), -1)[used]
+    carrier = replace(carrier, attributes=kept)
     return weld("array", points[used], carrier, notes)
 
 

@@ -51,6 +51,9 @@ class Carrier:
     textures: dict[str, bytes] = field(default_factory=dict)
     """The image files by the names that ``mtl`` uses."""
     face_colors: UInt8[np.ndarray, "faces 4"] | None = None
+    attributes: dict[str, Float[np.ndarray, "rows width"]] = field(default_factory=dict)
+    """Numbers and vectors that the file gives its vertices under names of their own: a PLY's
+    properties, a glTF's ``_NAME`` (here without the ``_``, vectors turned as its node is)."""
     ply: Any = None
     """A PLY file's `styleexp.meshes.ply_meshes.Table`."""
     document: Any = None
@@ -69,6 +72,16 @@ class Mesh:
     repairs: tuple[str, ...] = ()
     """One readable sentence for each thing that was repaired or left out."""
     carrier: Carrier | None = None
+
+
+def at_vertices(
+    mesh: Mesh, column: Float[np.ndarray, "rows width"]
+) -> Float[np.ndarray, "vertices width"]:
+    """What is given for the rows of a mesh's carrier, as means over the rows of each vertex."""
+    rows = np.arange(len(mesh.vertices)) if mesh.carrier is None else mesh.carrier.rows
+    sums = [np.bincount(rows, each, minlength=len(mesh.vertices)) for each in column.T]
+    counts = np.bincount(rows, minlength=len(mesh.vertices)).clip(min=1)
+    return np.stack(sums, axis=1) / counts[:, None]
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,8 @@ POSITION, NORMAL, COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", 
 UVS = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"), ("texture_s", "texture_t"))
 CORNERS = ("vertex_indices", "vertex_index")
 DISPLACEMENT = "displacement"
+VECTOR = {2: ("_x", "_y"), 3: ("_x", "_y", "_z"), 4: ("_x", "_y", "_z", "_w")}
+"""Ends of the names of a vector's numbers, as Blender writes them."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,27 @@ class Table:
     def rows(self) -> bool:
         """Whether vertices at one place may differ in more than colours and coordinates."""
         return bool(self.own) or NORMAL[0] in self.vertex
+
+
+def attributes_of(vertex: dict[str, Column], names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """The named properties as float64 (rows, width). Lists that are all of one length are vectors,
+    and so are three numbers ``NAME_x``, ``NAME_y`` and ``NAME_z`` (or without the ``_``)."""
+    found = {}
+    for name in names:
+        column = vertex[name]
+        if isinstance(column, np.ndarray):
+            found[name] = column.astype(np.float64)[:, None]
+        elif len(column.lengths) and column.lengths[0] > 0 and not np.ptp(column.lengths):
+            found[name] = column.values.astype(np.float64).reshape(len(column.lengths), -1)
+    for name in names:
+        stem = name[:-1].removesuffix("_")
+        three = [name[:-1] + axis for axis in "xyz"]
+        numbers_ = [found[each] for each in three if each in found and found[each].shape[1] == 1]
+        if name[-1] == "x" and stem and stem not in found and len(numbers_) == 3:
+            found[stem] = np.concatenate(numbers_, axis=1)
+            for each in three:
+                del found[each]
+    return found
 
 
 def read_ply(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
@@ -118,6 +141,7 @@ def read_ply(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
         face_part=np.zeros(len(owner), dtype=np.int64),
         materials=materials,
         face_material=face_material,
+        attributes=attributes_of(kept.vertex, kept.own),
         ply=kept,
     )
     return positions[chosen], carrier, notes
@@ -166,6 +190,11 @@ def ply_of(
     if carrier.uv is not None and not any(set(names) <= vertex.keys() for names in UVS):
         for k, name in enumerate("st"):
             vertex[name] = carrier.uv[first, k].astype(np.float32)
+    if carrier.ply is None:
+        for name, values in carrier.attributes.items():
+            ends = [""] if values.shape[1] == 1 else VECTOR.get(values.shape[1], ())
+            for k, end in enumerate(ends):
+                vertex.setdefault(name + end, values[first, k].astype(np.float32))
     if displacement is not None:
         vertex[DISPLACEMENT] = displacement.astype(np.float32)
     corners = Lists(np.full(len(faces), 3, np.uint8), faces.ravel().astype(np.int32))

@@ -28,9 +28,10 @@ def refine(mesh: Mesh, longest: float) -> Mesh:
 
     New vertices lie on a cubic curve through the ends of their edge that stands upright on the
     normals there (as in Vlachos et al. 2001), so smooth parts become no facets; at creases and
-    boundaries they lie in the middle. Texture coordinates, colours, materials, parts and groups are
-    carried over, seams stay seams. What only a PLY's or glTF file's own tables hold is left out,
-    with a note in ``repairs``. A mesh that is fine enough is returned as it is.
+    boundaries they lie in the middle. Texture coordinates, colours, the vertices' own numbers and
+    vectors, materials, parts and groups are carried over, seams stay seams. What else only a PLY's
+    or glTF file's own tables hold is left out, with a note in ``repairs``. A mesh that is fine
+    enough is returned as it is.
 
     Raises `UserError` where it would take more than `MOST_FACES` faces.
     """
@@ -61,7 +62,7 @@ def refine(mesh: Mesh, longest: float) -> Mesh:
     if len(carrier.corners) == before:
         return mesh
     left_out = "skins, animations and what else a glTF file holds" if carrier.document else ""
-    left_out = "a PLY file's own properties" if carrier.ply else left_out
+    left_out = _ply_alone(carrier) if carrier.ply else left_out
     note = f"refined from {before:,} to {len(carrier.corners):,} faces"
     if left_out:
         note += f", without {left_out}"
@@ -115,6 +116,7 @@ def _split(
         normals=_unit(of_rows(carrier.normals)),
         colors=of_rows(carrier.colors),
         shades=of_rows(carrier.shades),
+        attributes={name: _given(of_rows(values)) for name, values in carrier.attributes.items()},
         face_part=_taken(carrier.face_part, parent),
         face_material=_taken(carrier.face_material, parent),
         face_colors=_taken(carrier.face_colors, parent),
@@ -197,6 +199,22 @@ def _halves(a: np.ndarray, b: np.ndarray) -> Callable[[np.ndarray | None], np.nd
         return np.concatenate([column, mean.astype(column.dtype)])
 
     return extended
+
+
+def _given(column: np.ndarray | None) -> np.ndarray:
+    assert column is not None
+    return column
+
+
+def _ply_alone(carrier: Carrier) -> str:
+    """What of a PLY file's tables is in no other column."""
+    vertex = [each for each in carrier.ply.own if each not in carrier.attributes
+              and each[:-1].removesuffix("_") not in carrier.attributes]  # fmt: skip
+    parts = [
+        f"vertex properties ({', '.join(vertex)})" if vertex else "",
+        f"face properties ({', '.join(carrier.ply.own_faces)})" if carrier.ply.own_faces else "",
+    ]
+    return " and ".join(filter(None, parts))
 
 
 def _unit(normals: np.ndarray | None) -> np.ndarray | None:

@@ -92,7 +92,7 @@ def weld(
 
     carrier = replace(carrier, rows=rows, flipped=flipped)
     columns = (carrier.uv, carrier.normals, carrier.colors, carrier.ply, carrier.document)
-    if all(column is None for column in columns):
+    if all(column is None for column in columns) and not carrier.attributes:
         carrier = replace(carrier, corners=file_faces, rows=np.arange(len(vertices)))
     return Mesh(name, vertices, np.ascontiguousarray(faces), tuple(notes), carrier)
 

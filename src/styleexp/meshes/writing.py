@@ -112,7 +112,7 @@ def ply_rows(carrier: Carrier) -> tuple[np.ndarray, np.ndarray]:
     """The rows that a PLY file gets, in its order, and which of them each row became."""
     if carrier.ply is not None and carrier.ply.rows:
         return np.arange(len(carrier.rows)), np.arange(len(carrier.rows))
-    return _distinct(carrier.rows, carrier.uv, carrier.colors)
+    return _distinct(carrier.rows, carrier.uv, carrier.colors, *carrier.attributes.values())
 
 
 def _runs(carrier: Carrier, *more: np.ndarray) -> Iterator[tuple[int, int, np.ndarray]]:

@@ -49,7 +49,8 @@ class Judge:
 
     def style(self, config: Config, style: meshes.Mesh | np.ndarray, unit: float) -> Looks:
         """What the style looks like; measured once for each style and size."""
-        key = (repr(config.style), config.loss.target, isinstance(style, np.ndarray) and unit)
+        picture = isinstance(style, np.ndarray) and (unit, config.baseline is None)
+        key = (repr(config.style), config.loss.target, picture)
         if key not in self.styles:
             self.styles[key] = judged_style(style, config, self.encoder, unit)
         return self.styles[key]

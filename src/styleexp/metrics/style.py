@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch.nn import functional
 
-from styleexp import meshes, styles
-from styleexp.images import luminance
+from styleexp import meshes, pictures, styles
 from styleexp.losses import gram_matrix, layer_mask
 from styleexp.metrics.patches import SIZE, WINDOW, Relief, Windows, blurred, relief_of_mesh, windows
 from styleexp.renderers.base import Shading
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
     from torch import Tensor
 
-    from styleexp.config import Config, StyleConfig
+    from styleexp.config import Config
     from styleexp.encoders import Encoder
     from styleexp.losses import Grams
 
@@ -68,7 +67,7 @@ class Looks:
 
     shaded: Grams
     height: Grams | None = None
-    """None for a picture: its heights are not known."""
+    """None for a photograph: its heights are not known."""
     statistics: Statistics | None = None
     """Of a picture with its brightness for a height, whose unit means nothing."""
 
@@ -97,25 +96,30 @@ def judged_style(
     """
     if isinstance(style, meshes.Mesh):
         return judged(relief_of_mesh(style), 1.0, encoder, STYLE_WINDOWS)
-    return judged_picture(style, config.style, picture_span(config, unit) / unit, encoder)
+    return judged_picture(style, config, picture_span(config, unit) / unit, encoder)
 
 
 def judged_picture(
-    picture: Float[np.ndarray, "height width 3"], config: StyleConfig, span: float, encoder: Encoder
+    picture: Float[np.ndarray, "height width 3"], config: Config, span: float, encoder: Encoder
 ) -> Looks:
     """What the judge sees of a picture whose longer side is ``span`` patterns long."""
     level = float(shaded(torch.zeros(1, 8, 8)).mean())
     rgb = torch.from_numpy(picture)
+    heights = pictures.picture_height(config, picture)
 
     def cut(grey: Float[Tensor, "height width"]) -> Float[Tensor, "n size size"]:
         places = step_generator(0, 0, stream=12)
         pixels = span / WINDOW * SIZE
         return styles.picture_windows(grey, pixels, SIZE, STYLE_WINDOWS, places).image[..., 0]
 
-    shown, height = cut(styles.tone(rgb, level, config)), cut(luminance(rgb))
-    everywhere = torch.ones_like(shown, dtype=torch.bool)
-    found = statistics(Windows(height, everywhere))
-    return Looks(grams(encoder, shown, everywhere), None, found)
+    height = cut(heights.height)
+    everywhere = torch.ones_like(height, dtype=torch.bool)
+    if heights.in_proportion:  # as of a mesh, in widths of the window
+        seen = Windows(height * (span / WINDOW), everywhere)
+        lit = grams(encoder, shaded(seen.height), everywhere)
+        return Looks(lit, height_grams(encoder, seen), statistics(seen))
+    shown = cut(styles.tone(rgb, level, config.style))
+    return Looks(grams(encoder, shown, everywhere), None, statistics(Windows(height, everywhere)))
 
 
 def picture_span(config: Config, unit: float) -> float:

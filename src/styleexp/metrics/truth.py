@@ -22,7 +22,7 @@ import numpy as np
 import torch
 
 from styleexp import meshes, shapes, styles
-from styleexp.config import FieldConfig, StyleConfig
+from styleexp.config import Config, FieldConfig, StyleConfig
 from styleexp.encoders import load_encoder
 from styleexp.height_maps import HeightMap, triplanar
 from styleexp.images import luminance
@@ -263,7 +263,7 @@ def measure_pictures(
     encoder = load_encoder(judge)
     board, span = Board(), StyleConfig().image_tile * math.sqrt(4 * math.pi)
     for name, picture in pictures.items():
-        looks = judged_picture(picture, StyleConfig(), span, encoder)
+        looks = judged_picture(picture, Config(), span, encoder)
         board.styles[name] = Sample(looks, [], [])
     board.plain = Sample(judged_plain(encoder), [], [])
     for number, given in enumerate(sources):

@@ -195,7 +195,7 @@ def _assets(run: Run) -> list[dict[str, str]]:
         rows.append(
             {
                 "kind": kind,
-                "name": str(run.config.get(f"{kind}.path") or row.get("name")),
+                "name": str(run.config.get(f"{kind}.path") or row.get("name") or row.get("path")),
                 "sha256": row.get("sha256") or "–",
                 "origin": origin,
             }

@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from styleexp import height_maps, meshes
+from styleexp import attributes, height_maps, meshes
+from styleexp.attributes import ATTRIBUTE
 from styleexp.errors import UserError
 from styleexp.fields import zero_mean
 from styleexp.geometry import unfolded
+from styleexp.masks import masked
 from styleexp.relief import half_range, smoother
 from styleexp.scene import load
 from styleexp.stages import doing
@@ -52,11 +54,6 @@ class Synthesis:
 
     def __init__(self, config: SynthesisConfig):
         self.config = config
-        if config.direction not in ("auto", "up", "flow", "x", "y", "z"):
-            raise UserError(
-                f"baseline.direction={config.direction} is not allowed: give auto, up, flow, x, y "
-                "or z."
-            )
         if not 500 <= config.bank <= 200_000:
             raise UserError(f"baseline.bank={config.bank} is not allowed: give 500 to 200000.")
 
@@ -83,7 +80,7 @@ class Synthesis:
             surface.vertices.cpu().numpy(), scene.source.faces, surface.normals.cpu().numpy()
         )
         directed = pattern.directed > DIRECTED
-        ahead = self._field(sheet, directed)
+        ahead = directions(scene, sheet, directed)
         levels = levels_of(pattern, sheet.edge / scene.unit)
         print(told(scene, pattern, directed, levels), flush=True)
 
@@ -95,27 +92,31 @@ class Synthesis:
             doing(f"laying the relief, round {number} of {total}")
         displacement = height.double() * scene.unit * scene.config.strength
         displacement *= torch.from_numpy(fade(sheet, half_range(displacement.numpy())))
-        displacement = zero_mean(displacement, scene.areas.cpu().double(), math.inf)
+        displacement = zero_mean(displacement, scene.weights.cpu().double(), math.inf)
+        displacement = masked(displacement, scene.mask)
         if scene.config.field.unfold:
             displacement = unfolded(surface, displacement.to(surface.vertices.device)).cpu()
         moved = displacement.numpy() * scene.frame.scale
         offset = moved[:, None] * surface.normals.double().cpu().numpy()
         return Result(scene, moved, scene.source.vertices + offset)
 
-    def _field(self, sheet: Sheet, directed: bool) -> Float[np.ndarray, "vertices 3"]:
-        """Which way the pattern's up points at each vertex."""
-        name = self.config.direction
-        wish = np.zeros(3)
-        wish["xyz".index(name) if name in "xyz" else 1] = 1.0
-        follows = name == "flow" or (name == "auto" and not directed)
-        ahead = direction_field(
-            sheet, np.broadcast_to(wish, sheet.vertices.shape), FLOW if follows else UP
-        )
-        return turned(ahead, sheet.normals, math.radians(self.config.rotation))
+
+def directions(scene: Subject, sheet: Sheet, directed: bool) -> Float[np.ndarray, "vertices 3"]:
+    """Which way the pattern's up points at each vertex: see `config.StyleConfig`."""
+    style = scene.config.style
+    name = style.direction
+    if name.startswith(ATTRIBUTE):
+        wish = attributes.vectors(scene.source, name.removeprefix(ATTRIBUTE), "style.direction")
+    else:
+        axis = "xyz".index(name) if name in "xyz" else 1
+        wish = np.broadcast_to(np.eye(3)[axis], sheet.vertices.shape)
+    follows = name == "flow" or (name == "auto" and not directed)
+    ahead = direction_field(sheet, wish, FLOW if follows else UP)
+    return turned(ahead, sheet.normals, math.radians(style.rotation))
 
 
 def exemplar_of_style(scene: Subject) -> MeshExemplar | PictureExemplar:
-    """The style as an example; a picture's tone is its height, as high as ``scene.relief``."""
+    """The style as an example; a picture's heights are ``scene.relief`` high."""
     if isinstance(scene.style, meshes.Mesh):
         return exemplar_of(scene.style)
     tile = height_maps.height_map(scene, height_maps.PATCH)
