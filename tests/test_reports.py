@@ -117,7 +117,7 @@ def finished(tmp_path_factory):
     torus = shapes.make("torus")
     source = folder / "<script>alert(1)<b>.obj"
     save_mesh(torus, torus.vertices, source)
-    overrides = ["style=bubble", "profile=smoke", "encoder=vgg19_random"]
+    overrides = ["style=bubble", "method=robust", "profile=smoke", "encoder=vgg19_random"]
     config = compose(overrides)
     config.source.path = str(source)
     (folder / "run").mkdir()
@@ -182,7 +182,13 @@ def test_no_page_where_none_is_wanted(tmp_path):
     from styleexp.cli.run import run
     from styleexp.compose import compose
 
-    overrides = ["style=bubble", "source=torus", "profile=smoke", "encoder=vgg19_random"]
+    overrides = [
+        "style=bubble",
+        "source=torus",
+        "method=robust",
+        "profile=smoke",
+        "encoder=vgg19_random",
+    ]
     overrides.append("report=false")
     assert run(compose(overrides), tmp_path, overrides) == 0
     assert (tmp_path / "result.glb").exists()

@@ -1,5 +1,5 @@
-"""The methods beside the learned one: synthesis, the default, and those that the paper compares with
-(Sec. 4.2.3), run by the same command into the same run folder.
+"""The methods beside the learned one: synthesis, the default, and those that the paper compares
+with (Sec. 4.2.3), run by the same command into the same run folder.
 
 A baseline is what `styleexp.stylize` is, the four functions of a `Method`: the command line and
 ``styleexp.stylize(...)`` call nothing else of either. ``config.baseline`` names it, ``conf/method``
