@@ -26,7 +26,7 @@ GIVEN = ("source=torus", "style=bubble")
 """What an experiment may leave to be chosen, chosen."""
 
 BY_SYNTHESIS = {"board", "image_styles", "mesh_styles", "multi_style"}
-"""Experiments that show results, by the default method; others study learning or compare methods."""
+"""Experiments that show results, by the default method; others study learning or compare."""
 
 each_experiment = pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: path.stem)
 

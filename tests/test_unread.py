@@ -5,7 +5,9 @@ import subprocess
 import sys
 from dataclasses import is_dataclass
 
+import numpy as np
 import pytest
+from PIL import Image
 
 import styleexp
 from styleexp import baselines, meshes, scene, shapes, unread
@@ -23,6 +25,7 @@ OTHERS = (
     "field=vertex", "field.bound=0.5", "field.start=source", "field.zero_mean=false",
     "views.fov=50", "views.local.extent=0.2", "shading.lights=1", "shading.albedo=0.9",
     "loss=clip", "loss.target=same_views", "loss.relief_weight=0", "optim.schedule=step",
+    "style.image_contrast=0.3", "style.image_match_mean=false",
 )  # fmt: skip
 """What no method without learning reads."""
 
@@ -48,6 +51,8 @@ def small(tmp_path_factory):
     for name in ("sphere", "bubble"):
         mesh = shapes.make(name, 1000)
         meshes.save_mesh(mesh, mesh.vertices, folder / f"{name}.obj")
+    rows = np.sin(np.arange(64) / 3)[:, None] * 100 + 128
+    Image.fromarray(np.repeat(rows, 64, axis=1).astype(np.uint8)).save(folder / "rows.png")
     return (f"source.path={folder}/sphere.obj", f"style.path={folder}/bubble.obj")
 
 
@@ -74,9 +79,11 @@ def test_what_a_method_declares_is_what_it_reads(name, small, monkeypatch):
     assert seen == set(BASELINES[name].reads) - {"optim.checkpoint_every"}
 
 
+@pytest.mark.parametrize("style", ["bubble.obj", "rows.png"])
 @pytest.mark.parametrize("name", ["synthesis", "displacement_map"])
-def test_what_is_said_to_have_no_effect_has_none(name, small):
-    plain = [*small, f"method={name}", *OPTIONS[name]]
+def test_what_is_said_to_have_no_effect_has_none(name, style, small):
+    source, mesh = small
+    plain = [source, mesh.replace("bubble.obj", style), f"method={name}", *OPTIONS[name]]
     config = compose([*plain, *OTHERS])
     told = unread.note([config], [*plain, *OTHERS])
     assert told == f"{', '.join(OTHERS)} have no effect on the result with method={name}, {LEARNS}"
@@ -90,6 +97,7 @@ def test_what_is_said_to_have_no_effect_has_none(name, small):
         (["profile=fast"], "profile=fast has"),
         (["profile=fast,full"], "profile=fast,full has"),
         (["+switch=lights"], "+switch=lights has"),
+        (["+switch=image_tone"], "+switch=image_tone has"),
         (["optim.seed=3", "field.unfold=false", "field.sigma=4", "strength=0.5"], None),
         (["profile=smoke"], None),  # which makes the pictures smaller, too
         (["+switch=sigma"], None),

@@ -22,6 +22,8 @@ EVERY_RUN = (
     "strength", "device", "threads", "debug",
 )  # fmt: skip
 """What is read whatever the method."""
+FOR_RENDERS = ("style.image_contrast", "style.image_match_mean")
+"""What is read only to compare a picture with renders, although it is a key of ``style``."""
 PARTS = ("renderer", "encoder", "field", "loss")
 """Keys that also choose the part of that name."""
 
@@ -57,7 +59,10 @@ def _is_unread(override: str, read: Sequence[str]) -> bool:
     found = re.match(r"[+~]*([\w./-]+)(?:@[^=]*)?(?:=(.*))?", override, re.DOTALL)
     keys = _keys(found[1], found[2] or "") if found else []
     return bool(keys) and not any(
-        _covers(known, key) or _covers(key, known) for key in keys for known in read
+        _covers(known, key) or _covers(key, known)
+        for key in keys
+        if key not in FOR_RENDERS
+        for known in read
     )
 
 
