@@ -488,6 +488,12 @@ def test_what_clip_lacks_is_said(clip, tmp_path):
             run("method=text2mesh", "encoder=clip", f"encoder.weights={folder}", "source=sphere",
                 "style=bubble")  # fmt: skip
     with pytest.raises(UserError, match="use loss=clip"):
-        run("encoder=clip", f"encoder.weights={clip}", "source=sphere", "style=bubble")
+        run(
+            "method=robust",
+            "encoder=clip",
+            f"encoder.weights={clip}",
+            "source=sphere",
+            "style=bubble",
+        )
     with pytest.raises(UserError, match="use encoder=clip"):
-        run("loss=clip", "source=sphere", "style=bubble")
+        run("method=robust", "loss=clip", "source=sphere", "style=bubble")
