@@ -150,7 +150,18 @@ def test_every_finished_run_leaves_its_page(finished):
     assert re.search(
         r"<dt>asked for</dt><dd>[^<]*style=bubble [^<]*encoder=vgg19_random</dd>", text
     )
+    assert "<dt>method</dt><dd>learned</dd>" in text
     assert "Apache License" in text
+
+
+def test_a_page_names_the_method(tmp_path):
+    def named(config):
+        run = folders.Run(tmp_path, record={"config": config})
+        return dict(page.facts(run, shown.Shown())).get("method")
+
+    assert named({"baseline": {"name": "synthesis"}}) == "synthesis"
+    assert named({"baseline": None}) == "learned"
+    assert named({}) is None
 
 
 def test_names_are_text_and_the_policy_knows_the_only_script(finished):
