@@ -38,7 +38,7 @@ export STYLEEXP_ASSETS ?= $(wildcard $(abspath ../shared))
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
-	$(BIN)/styleexp critter scales method=synthesis hydra.run.dir=outputs/demo
+	$(BIN)/styleexp critter scales hydra.run.dir=outputs/demo
 
 test: $(VENV)/.installed-dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal

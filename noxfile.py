@@ -34,7 +34,7 @@ nox.options.error_on_missing_interpreters = False
 def check(session: nox.Session) -> None:
     """A run, its page, its metrics, a sweep and a few tests, away from the checkout."""
     away = Path(session.create_tmp())
-    small = ["source=torus", "style=rail", "profile=smoke", "encoder=vgg19_random"]
+    small = ["source=torus", "style=rail", "method=robust", "profile=smoke", "encoder=vgg19_random"]
     session.install("pytest", "jaxtyping")
     with session.chdir(away):
         session.run("python", str(ROOT / "tests" / "installed.py"))

@@ -92,7 +92,7 @@ STEP = """
 from styleexp import baselines
 from styleexp.compose import compose
 config = compose(["source=torus", "style=bubble", "encoder=vgg19_random", "profile=fast",
-                  "loss.bank_views=2", "threads=1"])
+                  "method=robust", "loss.bank_views=2", "threads=1"])
 method = baselines.method(config)
 scene = method.prepare(config)
 steps = method.optimise(scene, method.start(scene))

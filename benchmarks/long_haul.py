@@ -39,7 +39,7 @@ MARKS = {
     for kind in ("steps", "runs", "jobs")
 }
 SMALL = (
-    "profile=smoke", "encoder=vgg16", "optim.steps=1", "views.resolution=48",
+    "method=robust", "profile=smoke", "encoder=vgg16", "optim.steps=1", "views.resolution=48",
     "preview.resolution=32", "preview.turntable_frames=2", "report=false",
 )  # fmt: skip
 WARM_UP = 0.2
@@ -129,7 +129,14 @@ def many_steps(count: int, until: float, every: int = 5) -> list[Sample]:
     from styleexp import baselines
     from styleexp.compose import compose
 
-    given = ["source=torus", "style=bubble", "profile=fast", "threads=1", f"optim.steps={count}"]
+    given = [
+        "source=torus",
+        "style=bubble",
+        "method=robust",
+        "profile=fast",
+        "threads=1",
+        f"optim.steps={count}",
+    ]
     config = compose(given)
     method = baselines.method(config)
     scene = method.prepare(config)

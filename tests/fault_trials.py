@@ -29,8 +29,9 @@ from typing import Any
 NUMBERS = itertools.count()
 STEPS = 6
 SMALL = (
-    "source.path=ball.ply", "style.path=knobs.ply", "profile=smoke", "encoder=vgg19_random",
-    "preview.resolution=32", "metrics.judge=none", "optim.checkpoint_every=1",
+    "source.path=ball.ply", "style.path=knobs.ply", "method=robust", "profile=smoke",
+    "encoder=vgg19_random", "preview.resolution=32", "metrics.judge=none",
+    "optim.checkpoint_every=1",
 )  # fmt: skip
 RUN = (*SMALL, f"optim.steps={STEPS}")
 PLAN = f"""\

@@ -14,7 +14,7 @@ NEEDS = {
     "launcher=joblib": "sweep",
     "+search=optuna": "search",
 }
-SMALL = ["source=torus", "style=rail", "profile=smoke", "metrics.judge=none"]
+SMALL = ["source=torus", "style=rail", "method=robust", "profile=smoke", "metrics.judge=none"]
 
 
 def refused(override: str) -> str:

@@ -20,6 +20,7 @@ from styleexp.baselines.specs import DisplacementMapConfig
 from styleexp.compose import compose
 from styleexp.errors import UserError
 from styleexp.fields import VertexField
+from styleexp.synthesis.method import Synthesis
 
 SMOKE = ("profile=smoke", "encoder=vgg19_random")
 FOLDER = {"run.json", "status.json", "metrics.json", "preview.png", "turntable.gif", "result.ply",
@@ -47,10 +48,9 @@ def run(*overrides):
 # ---------------------------------------------------------------------------------------- choosing
 
 
-def test_without_a_baseline_the_method_is_the_papers():
-    assert baselines.method(compose(["source=torus", "style=bubble"])) is sys.modules[
-        "styleexp.stylize"
-    ]  # fmt: skip
+def test_synthesis_is_the_default_and_without_a_baseline_the_method_is_the_papers():
+    assert isinstance(baselines.method(compose([])), Synthesis)
+    assert baselines.method(compose(["method=robust"])) is sys.modules["styleexp.stylize"]
 
 
 def test_a_baseline_from_python(tmp_path):
@@ -491,6 +491,12 @@ def test_what_clip_lacks_is_said(clip, tmp_path):
             run("method=text2mesh", "encoder=clip", f"encoder.weights={folder}", "source=sphere",
                 "style=bubble")  # fmt: skip
     with pytest.raises(UserError, match="use loss=clip"):
-        run("encoder=clip", f"encoder.weights={clip}", "source=sphere", "style=bubble")
+        run(
+            "method=robust",
+            "encoder=clip",
+            f"encoder.weights={clip}",
+            "source=sphere",
+            "style=bubble",
+        )
     with pytest.raises(UserError, match="use encoder=clip"):
-        run("loss=clip", "source=sphere", "style=bubble")
+        run("method=robust", "loss=clip", "source=sphere", "style=bubble")

@@ -42,6 +42,11 @@ def smoke(tmp_path_factory):
     return [*SMOKE, f"source.path={folder}/sphere.obj", f"style.path={folder}/bubble.obj"]
 
 
+@pytest.fixture(scope="module")
+def learned(smoke):
+    return [*smoke, "method=robust"]
+
+
 def test_contenders_take_turns():
     ran = []
     times = interleaved({"a": lambda: ran.append("a"), "b": lambda: ran.append("b")}, 3)
@@ -122,8 +127,8 @@ def test_the_instruments_leave_the_renderer_as_it_was():
     assert after == before
 
 
-def test_a_steps_parts_sum_to_the_step(smoke):
-    found = step.measure(smoke, 1)  # of several, medians are told, which don't sum
+def test_a_steps_parts_sum_to_the_step(learned):
+    found = step.measure(learned, 1)  # of several, medians are told, which don't sum
     for key in ("", "cpu_"):
         parts, whole = found[f"parts_{key}ms"], found[f"step_{key}ms"]
         assert sum(parts.values()) == pytest.approx(whole)
@@ -137,16 +142,16 @@ def test_a_steps_parts_sum_to_the_step(smoke):
     assert found["steps"] == 1
 
 
-def test_the_parts_do_not_change_the_result(smoke):
+def test_the_parts_do_not_change_the_result(learned):
     from styleexp import baselines
     from styleexp.compose import compose
 
-    config = compose([*smoke, "optim.steps=3"])
+    config = compose([*learned, "optim.steps=3"])
     method = baselines.method(config)
     scene = method.prepare(config)
     losses = [each.loss for each in method.optimise(scene, method.start(scene))]
     seen = []
-    step.measure([*smoke, "optim.steps=3"], 1, seen.append)
+    step.measure([*learned, "optim.steps=3"], 1, seen.append)
     # Gradients are added up in another order, no more.
     assert [each.loss for each in seen] == pytest.approx(losses, rel=1e-3)
     assert seen[0].loss == losses[0]
@@ -185,7 +190,7 @@ def test_convergence_measures_both_methods_and_can_be_redrawn(tmp_path, capsys, 
         (["render", "--mesh", "nothing"], "unknown shape 'nothing'"),
         (["render", "--device", "cuda:77"], "can't be used"),
         (["step", "optim.stepz=3"], "did you mean optim.steps"),
-        (["step", *SMOKE, "method=displacement_map", *SHAPES], "no steps of the style loss"),
+        (["step", *SMOKE, *SHAPES, "source.refine=none"], "no steps of the style loss"),
         (["convergence", *SMOKE, "method=paper"], "--methods"),
         (["convergence", "--redraw", "nowhere.json"], "can't be drawn"),
     ],

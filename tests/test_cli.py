@@ -12,7 +12,7 @@ import pytest
 
 import styleexp
 
-SMOKE = ["profile=smoke", "encoder=vgg19_random"]
+SMOKE = ["method=robust", "profile=smoke", "encoder=vgg19_random"]
 
 
 def command(*arguments, cwd, **more):

@@ -12,9 +12,11 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-SMALL = ("profile=smoke", "encoder=vgg19_random", "metrics.judge=none", "preview.resolution=48",
+SMALL = ("profile=smoke", "metrics.judge=none", "preview.resolution=48",
          "preview.turntable_frames=2", "threads=1")  # fmt: skip
 """Added to the tutorial's runs, after their own `profile=fast`, so that they take seconds."""
+LEARNED = ("encoder=vgg19_random",)
+BY_SYNTHESIS = ("source.refine=none", "baseline.bank=500")
 
 
 def rows():
@@ -54,7 +56,7 @@ def test_the_tutorials_commands_run(tmp_path):
     for name, *arguments in listed:
         module = "styleexp" + name.removeprefix("styleexp").replace("-", ".cli.")
         if name == "styleexp" and not arguments[0].startswith("resume="):
-            arguments += SMALL
+            arguments += [*SMALL, *(LEARNED if "method=robust" in arguments else BY_SYNTHESIS)]
         if name == "styleexp-metrics":
             arguments += ["--judge", "none"]
         done = subprocess.run(
@@ -62,8 +64,8 @@ def test_the_tutorials_commands_run(tmp_path):
             capture_output=True, text=True, timeout=600, check=False,
         )  # fmt: skip
         assert done.returncode == 0, (name, arguments, done.stderr)
-    assert {path.name for path in (tmp_path / "outputs").iterdir()} == {"first", "two"}
-    for told in ("first/report.html", "first/result.glb", "two/table.csv", "two/figure.png",
+    assert {path.name for path in (tmp_path / "outputs").iterdir()} == {"first", "two", "learned"}
+    for told in ("first/report.html", "learned/result.glb", "two/table.csv", "two/figure.png",
                  "two/report.html", "two/1/report.html"):  # fmt: skip
         assert (tmp_path / "outputs" / told).is_file(), told
 

@@ -25,6 +25,9 @@ EXPERIMENTS = sorted((CONF / "experiment").glob("*.yaml"))
 GIVEN = ("source=torus", "style=bubble")
 """What an experiment may leave to be chosen, chosen."""
 
+BY_SYNTHESIS = {"board", "image_styles", "mesh_styles", "multi_style"}
+"""Experiments that show results, by the default method; others study learning or compare."""
+
 each_experiment = pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: path.stem)
 
 
@@ -54,6 +57,10 @@ def test_experiment_names_its_figure_its_command_and_its_time(path):
     assert f"styleexp +experiment={path.stem}" in head
     assert re.search(r"[Mm]inutes.*fast \d+|fast \d+ minutes", head)
     assert re.search(r"standard (about )?\d+", head)
+    assert ("With method=robust:" in head) == (path.stem in BY_SYNTHESIS)
+    assert (re.search(r"On two cores: \d+ minutes, a", head) is not None) == (
+        path.stem in BY_SYNTHESIS
+    )
 
 
 @each_experiment
@@ -74,8 +81,54 @@ def test_experiment_is_a_delta(path):
 def test_every_job_of_every_experiment_is_valid(path):
     jobs = experiment_jobs([f"+experiment={path.stem}"])
     assert len(jobs) > 1
+    methods = set()
     for overrides in jobs:
-        config.check(compose([*overrides, "hydra.mode=RUN"]))
+        made = compose([*overrides, "hydra.mode=RUN"])
+        config.check(made)
+        methods.add(getattr(made.baseline, "name", "learned"))
+    robust = compose([*jobs[0], "method=robust", "hydra.mode=RUN"])
+    assert (robust.baseline, robust.source.refine) == (None, "none")
+    if path.stem.startswith("baselines"):
+        assert methods >= {"synthesis", "learned", "displacement_map"}
+    else:
+        assert methods == {"synthesis" if path.stem in BY_SYNTHESIS else "learned"}
+
+
+SETS = {
+    "robust": {},
+    "paper": {},
+    "vertex": {},
+    "text2mesh": {},
+    "displacement_map": {"baseline": "displacement_map"},
+    "geometric_textures": {"baseline": "geometric_textures"},
+    "synthesis": {"baseline": "synthesis", "source.refine": "auto"},
+}
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_a_method_sets_what_its_file_says_and_nothing_of_the_default(name):
+    """It is `robust`, whose values are the dataclasses', but for its own file."""
+    assert {path.stem for path in (CONF / "method").glob("*.yaml")} == set(SETS)
+    sized = ["views.local.per_view"]  # by the profile, which comes after
+    body = OmegaConf.to_container(OmegaConf.load(CONF / "method" / f"{name}.yaml"))
+    parts = dict(next(iter(each.items())) for each in body.pop("defaults", []))
+    parts = {key.removeprefix("override /"): value for key, value in parts.items()}
+    made, robust = (compose([*GIVEN, f"method={each}"]) for each in (name, "robust"))
+    assert (made.baseline and made.baseline.name) == SETS[name].get("baseline")
+    assert made.source.refine == SETS[name].get("source.refine", "none")
+    assert all(getattr(made, part).name == chosen for part, chosen in parts.items())
+    made, robust = (dict(flat(asdict(each))) for each in (made, robust))
+    own = {key: value for key, value in flat(body) if key not in sized}
+    assert own.items() <= made.items()
+    differing = {key for key in made.keys() | robust.keys() if made.get(key) != robust.get(key)}
+    assert not {key for key in differing - own.keys() if key.split(".")[0] not in parts}
+
+
+def test_robust_is_the_dataclasses_defaults():
+    made = dict(flat(asdict(compose(["method=robust"]))))
+    default = dict(flat(asdict(config.Config())))
+    sizes = dict(flat(OmegaConf.to_container(OmegaConf.load(CONF / "profile" / "standard.yaml"))))
+    assert not {key for key in default if made.get(key) != default[key]} - sizes.keys()
 
 
 @each_experiment
@@ -86,6 +139,10 @@ def test_experiment_runs(path, tmp_path):
     for key, values in params.items():
         names = [name.strip() for name in values.split(",")]
         arguments.append(f"{key}={names[0]},{names[-1]}")
+    if path.stem == "multi_style":  # one by the default, which takes longer than four steps
+        arguments += ["source.refine=none", "baseline.bank=500"]
+    elif path.stem in BY_SYNTHESIS:
+        arguments.append("method=robust")
     for overrides in experiment_jobs([f"+experiment={path.stem}", *arguments]):
         chosen = compose([*overrides, "hydra.mode=RUN"])
         for name in (chosen.source.name, chosen.style.name):
@@ -128,7 +185,8 @@ def test_a_failed_job_under_joblib_fails_the_sweep_and_is_in_the_table(tmp_path)
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="needs the extra sweep")
     done = styleexp(
         "-m", "source=torus", "style=bubble", "style.path=null,none.obj", "launcher=joblib",
-        "profile=smoke", "encoder=vgg19_random", "hydra.sweep.dir=all", cwd=tmp_path,
+        "method=robust", "profile=smoke", "encoder=vgg19_random", "hydra.sweep.dir=all",
+        cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 2
     assert "none.obj" in done.stdout

@@ -283,7 +283,7 @@ def test_a_plan_refuses_another_run_in_a_jobs_folder(swept, tmp_path):
 
     from styleexp.cli.sweep import main
 
-    text = "profile: smoke\noverrides: [encoder=vgg19_random]\nexperiments:\n"
+    text = "profile: smoke\noverrides: [method=robust, encoder=vgg19_random]\nexperiments:\n"
     (tmp_path / "plan.yaml").write_text(text + "  - {name: a, pairs: [[torus, rail]]}\n")
     from styleexp.sweeps import plan
 

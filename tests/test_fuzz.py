@@ -205,7 +205,7 @@ def test_random_overrides_make_a_configuration_or_one_sentence(chosen):
     from omegaconf.errors import OmegaConfBaseException
 
     try:
-        config = compose(["profile=smoke", *chosen])
+        config = compose(["method=robust", "profile=smoke", *chosen])
         check(config)
     except UserError as told:
         assert str(told)  # noqa: PT017

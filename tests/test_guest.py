@@ -13,7 +13,7 @@ import styleexp
 from styleexp import shapes
 from styleexp.errors import UserError
 
-SMOKE = ("profile=smoke", "encoder=vgg19_random", "metrics.judge=none")
+SMOKE = ("method=robust", "profile=smoke", "encoder=vgg19_random", "metrics.judge=none")
 pytestmark = pytest.mark.filterwarnings("ignore")
 
 HOST = '''
@@ -35,7 +35,7 @@ class Host:
 
 ConfigStore.instance().store(name="base_config", node=Host)
 ConfigStore.instance().store(group="encoder", name="vgg16", node={"mine": 1})
-SMOKE = ("profile=smoke", "encoder=vgg19_random", "metrics.judge=none")
+SMOKE = ("method=robust", "profile=smoke", "encoder=vgg19_random", "metrics.judge=none")
 
 def state():
     return (torch.get_num_threads(), torch.get_rng_state().tolist(), random.getstate(),

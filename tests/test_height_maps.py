@@ -14,7 +14,13 @@ from styleexp.height_maps import HeightMap, mesh_patch, triplanar
 from styleexp.scene import prepare
 from styleexp.stylize import displace, start
 
-SMALL = ("profile=smoke", "encoder=vgg19_random", "encoder.precision=fp32", "source=torus")
+SMALL = (
+    "method=robust",
+    "profile=smoke",
+    "encoder=vgg19_random",
+    "encoder.precision=fp32",
+    "source=torus",
+)
 pytestmark = pytest.mark.filterwarnings("ignore:the encoder 'vgg19_random'")
 
 

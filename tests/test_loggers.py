@@ -16,8 +16,8 @@ from styleexp.identity import essence, job_key
 from styleexp.loggers import Loggers
 
 SMOKE = (
-    "source=torus", "style=bubble", "profile=smoke", "encoder=vgg19_random", "report=false",
-    "metrics.judge=none", "metrics.windows=2",
+    "source=torus", "style=bubble", "method=robust", "profile=smoke", "encoder=vgg19_random",
+    "report=false", "metrics.judge=none", "metrics.windows=2",
     "preview.turntable_frames=2", "preview.resolution=64", "threads=1",
 )  # fmt: skip
 LOGGER = """

@@ -300,7 +300,13 @@ def board(tmp_path_factory):
 
     folder = tmp_path_factory.mktemp("board")
     for name in ("bubble", "stripe"):
-        overrides = ["source=torus", f"style={name}", "profile=smoke", "encoder=vgg19_random"]
+        overrides = [
+            "source=torus",
+            f"style={name}",
+            "method=robust",
+            "profile=smoke",
+            "encoder=vgg19_random",
+        ]
         assert run(compose([*overrides, "report=false"]), folder / name, overrides) == 0
     (folder / "failed").mkdir()
     (folder / "failed" / "run.json").write_text((folder / "bubble" / "run.json").read_text())

@@ -179,7 +179,13 @@ def test_mistakes_are_user_errors() -> None:
 
 
 def _command(folder, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    smoke = ["source=torus", "style=bubble", "profile=smoke", "encoder=vgg19_random"]
+    smoke = [
+        "source=torus",
+        "style=bubble",
+        "method=robust",
+        "profile=smoke",
+        "encoder=vgg19_random",
+    ]
     return subprocess.run(
         [sys.executable, "-m", "styleexp", "renderer=mitsuba_ad", *smoke, *arguments],
         cwd=folder,

@@ -22,7 +22,7 @@ from styleexp.renderers.moderngl_deferred import ModernGLDeferred
 from styleexp.renderers.soft_raster import SoftRaster
 from styleexp.views import orbit, zoom
 
-SMOKE = ["source=torus", "style=bubble", "profile=smoke", "encoder=vgg19_random"]
+SMOKE = ["source=torus", "style=bubble", "method=robust", "profile=smoke", "encoder=vgg19_random"]
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,13 @@ from styleexp.scene import prepare
 from styleexp.stylize import Diverged, blank, optimise, start
 from styleexp.viewer import Images
 
-SMOKE = ("profile=smoke", "encoder=vgg19_random", "style=bubble", "optim.checkpoint_every=1")
+SMOKE = (
+    "method=robust",
+    "profile=smoke",
+    "encoder=vgg19_random",
+    "style=bubble",
+    "optim.checkpoint_every=1",
+)
 pytestmark = pytest.mark.filterwarnings("ignore:the encoder 'vgg19_random'")
 
 

@@ -144,7 +144,7 @@ def test_a_sweep_shows_the_others_beside_one_of_a_later_version(old, capsys, tmp
 def test_a_plan_does_not_touch_a_job_of_a_later_version(old, capsys, tmp_path):
     from styleexp.sweeps import plan
 
-    text = "profile: smoke\noverrides: [encoder=vgg19_random]\nexperiments:\n"
+    text = "profile: smoke\noverrides: [method=robust, encoder=vgg19_random]\nexperiments:\n"
     (tmp_path / "plan.yaml").write_text(text + "  - {name: a, pairs: [[torus, rail]]}\n")
     ((job,),) = plan.jobs(plan.read(tmp_path / "plan.yaml"), tmp_path / "out").values()
     old(LATER, f"out/{job.name}", schema=SCHEMA + 1)

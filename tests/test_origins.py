@@ -14,7 +14,7 @@ import pytest
 from styleexp import identity, meshes, origins, shapes
 from styleexp.errors import UserError
 
-SMOKE = ["profile=smoke", "encoder=vgg19_random", "report=false", "threads=1",
+SMOKE = ["method=robust", "profile=smoke", "encoder=vgg19_random", "report=false", "threads=1",
          "preview.resolution=32", "preview.turntable_frames=1"]  # fmt: skip
 
 
@@ -89,7 +89,7 @@ def finished(tmp_path_factory):
     home = tmp_path_factory.mktemp("finished")
     save("torus", home / "t.ply")
     save("stripe", home / "s.ply", detail=2000)
-    given = ("source.path=t.ply", "style.path=s.ply", "method=displacement_map", *SMOKE)
+    given = ("source.path=t.ply", "style.path=s.ply", *SMOKE, "method=displacement_map")
     done = run("styleexp", *given, "hydra.run.dir=run", cwd=home)
     assert done.returncode == 0, done.stderr
     return home
@@ -149,7 +149,7 @@ def test_a_source_that_changed_or_is_gone_is_refused_by_its_name(change, told, l
 
 def test_a_run_begun_where_hydra_changes_the_folder_has_its_own_source(tmp_path):
     save("torus", tmp_path / "t.ply")
-    given = ("source.path=t.ply", "style=bubble", "method=displacement_map", *SMOKE)
+    given = ("source.path=t.ply", "style=bubble", *SMOKE, "method=displacement_map")
     done = run("styleexp", *given, "hydra.job.chdir=true", "hydra.run.dir=run", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     record = json.loads((tmp_path / "run" / "run.json").read_text())

@@ -50,7 +50,13 @@ def test_installed_wheel_runs_from_an_empty_folder(wheel, tmp_path):
         cwd=empty, env=environment, capture_output=True, text=True, check=True,
     ).stdout  # fmt: skip
     assert where.startswith(str(target)), "the checkout was imported, not the wheel"
-    arguments = ["source=torus", "style=bubble", "profile=smoke", "encoder=vgg19_random"]
+    arguments = [
+        "source=torus",
+        "style=bubble",
+        "method=robust",
+        "profile=smoke",
+        "encoder=vgg19_random",
+    ]
     done = subprocess.run(
         [sys.executable, "-m", "styleexp", *arguments, "hydra.run.dir=run"],
         cwd=empty, env=environment, capture_output=True, text=True, check=False,

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-SMOKE = ["source=torus", "profile=smoke", "hydra.run.dir=run"]
+SMOKE = ["source=torus", "method=robust", "profile=smoke", "hydra.run.dir=run"]
 
 GOOD = """
     from dataclasses import dataclass
@@ -338,7 +338,7 @@ def test_every_kind_of_plugin_runs_beside_broken_ones_and_resumes(installed, tmp
     done = styleexp(
         "renderer=lab_renderer", "renderer.samples=7", "encoder=lab_encoder", "style=lab_style",
         "style.period=8", "field=lab_field", "field.gain=2", "field.sigma=3", "loss=lab_loss",
-        "loss.power=0.5", "layers=low", "method=paper", *SMOKE, cwd=tmp_path, path=installed,
+        "loss.power=0.5", "layers=low", *SMOKE, "method=paper", cwd=tmp_path, path=installed,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "samples 7" in done.stdout
@@ -361,8 +361,8 @@ def test_every_kind_of_plugin_runs_beside_broken_ones_and_resumes(installed, tmp
 def test_a_style_of_a_plugin_from_python(installed, tmp_path):
     code = (
         "import styleexp\n"
-        "r = styleexp.stylize('torus', 'lab_style', 'profile=smoke', 'encoder=vgg19_random', "
-        "'style.period=24')\n"
+        "r = styleexp.stylize('torus', 'lab_style', 'method=robust', 'profile=smoke', "
+        "'encoder=vgg19_random', 'style.period=24')\n"
         "print(r.scene.config.style.period, r.scene.style.shape)"
     )
     done = process(sys.executable, "-c", code, cwd=tmp_path, path=installed)
@@ -414,7 +414,7 @@ def test_launchers(launcher, tmp_path):
     (tmp_path / "lab.py").write_text(textwrap.dedent(GOOD))
     done = styleexp(
         "-m", f"hydra/launcher={launcher}", "renderer=quick,soft_raster", "source=torus",
-        "style=bubble", "profile=smoke", "encoder=vgg19_random", "optim.steps=1",
+        "style=bubble", "method=robust", "profile=smoke", "encoder=vgg19_random", "optim.steps=1",
         "preview.turntable_frames=1", "hydra.sweep.dir=all",
         cwd=tmp_path, STYLEEXP_PLUGINS="renderer=lab:QUICK",
     )  # fmt: skip

@@ -17,7 +17,13 @@ from styleexp.stylize import finish, optimise, start
 
 NEAR = 0.05
 """Of the largest displacement, after three steps; 1e-4 and 1e-2 was measured. Another mesh is 1."""
-FAST = ("profile=smoke", "encoder=vgg19_random", "encoder.precision=fp32", "optim.steps=3")
+FAST = (
+    "method=robust",
+    "profile=smoke",
+    "encoder=vgg19_random",
+    "encoder.precision=fp32",
+    "optim.steps=3",
+)
 IMAGE = "views.local.mode=image"
 pytestmark = pytest.mark.filterwarnings("ignore:the encoder 'vgg19_random'")
 

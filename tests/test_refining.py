@@ -118,8 +118,8 @@ def test_too_many_faces_are_refused(monkeypatch):
 def test_a_run_refines_for_its_style_and_says_so():
     from styleexp import scene
 
-    plain = scene.load(compose(["source=sphere", "style=scales"]))
-    fine = scene.load(compose(["source=sphere", "style=scales", "source.refine=auto"]))
+    plain = scene.load(compose(["source=sphere", "style=scales", "source.refine=none"]))
+    fine = scene.load(compose(["source=sphere", "style=scales"]))
     assert len(fine.source.faces) > len(plain.source.faces)
     longest = as_trimesh(fine.source).edges_unique_length.max() / fine.frame.scale
     assert longest <= 1 / fine.sigma / scene.PER_WAVE

@@ -5,7 +5,7 @@ from styleexp import meshes, remembered, shapes
 from styleexp.compose import compose
 from styleexp.scene import prepare
 
-SMOKE = ["encoder=vgg19_random", "profile=smoke"]
+SMOKE = ["encoder=vgg19_random", "method=robust", "profile=smoke"]
 
 
 @pytest.fixture

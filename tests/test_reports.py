@@ -117,7 +117,7 @@ def finished(tmp_path_factory):
     torus = shapes.make("torus")
     source = folder / "<script>alert(1)<b>.obj"
     save_mesh(torus, torus.vertices, source)
-    overrides = ["style=bubble", "profile=smoke", "encoder=vgg19_random"]
+    overrides = ["style=bubble", "method=robust", "profile=smoke", "encoder=vgg19_random"]
     config = compose(overrides)
     config.source.path = str(source)
     (folder / "run").mkdir()
@@ -150,7 +150,18 @@ def test_every_finished_run_leaves_its_page(finished):
     assert re.search(
         r"<dt>asked for</dt><dd>[^<]*style=bubble [^<]*encoder=vgg19_random</dd>", text
     )
+    assert "<dt>method</dt><dd>learned</dd>" in text
     assert "Apache License" in text
+
+
+def test_a_page_names_the_method(tmp_path):
+    def named(config):
+        run = folders.Run(tmp_path, record={"config": config})
+        return dict(page.facts(run, shown.Shown())).get("method")
+
+    assert named({"baseline": {"name": "synthesis"}}) == "synthesis"
+    assert named({"baseline": None}) == "learned"
+    assert named({}) is None
 
 
 def test_names_are_text_and_the_policy_knows_the_only_script(finished):
@@ -182,7 +193,13 @@ def test_no_page_where_none_is_wanted(tmp_path):
     from styleexp.cli.run import run
     from styleexp.compose import compose
 
-    overrides = ["style=bubble", "source=torus", "profile=smoke", "encoder=vgg19_random"]
+    overrides = [
+        "style=bubble",
+        "source=torus",
+        "method=robust",
+        "profile=smoke",
+        "encoder=vgg19_random",
+    ]
     overrides.append("report=false")
     assert run(compose(overrides), tmp_path, overrides) == 0
     assert (tmp_path / "result.glb").exists()

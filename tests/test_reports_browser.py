@@ -11,7 +11,7 @@ import pytest
 from browser import browser, check_quiet, covered, pixels, wait
 
 EVIL = "<img src=x onerror=alert(1)>"
-SMOKE = ["profile=smoke", "encoder=vgg19_random"]
+SMOKE = ["method=robust", "profile=smoke", "encoder=vgg19_random"]
 PARTICIPANTS = 20
 
 

@@ -158,7 +158,13 @@ def test_a_checkpoint_with_a_pickle_inside_is_damaged_not_run(tmp_path):
     with one_encoder():
         scene = prepare(
             compose.compose(
-                ["profile=smoke", "encoder=vgg19_random", "source=torus", "style=bubble"]
+                [
+                    "method=robust",
+                    "profile=smoke",
+                    "encoder=vgg19_random",
+                    "source=torus",
+                    "style=bubble",
+                ]
             )
         )
     state = start(scene)

@@ -21,7 +21,7 @@ from styleexp.stylize import (
     start,
 )
 
-SMOKE = ("profile=smoke", "encoder=vgg19_random")
+SMOKE = ("method=robust", "profile=smoke", "encoder=vgg19_random")
 pytestmark = pytest.mark.filterwarnings("ignore:the encoder 'vgg19_random'")
 
 

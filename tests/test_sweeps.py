@@ -26,7 +26,7 @@ STEPS = 5 * KILLS
 
 PLAN = f"""\
 profile: smoke
-overrides: [encoder=vgg19_random, source=torus, optim.steps={STEPS}, threads=1]
+overrides: [method=robust, encoder=vgg19_random, source=torus, optim.steps={STEPS}, threads=1]
 experiments:
   - name: styles
     figure: Fig. 2
@@ -202,7 +202,7 @@ def test_what_is_done_is_not_done_again_and_a_changed_job_is(undisturbed, tmp_pa
 def test_a_failed_job_stays_failed_until_it_is_retried(tmp_path):
     from styleexp import meshes, shapes
 
-    text = "profile: smoke\noverrides: [encoder=vgg19_random]\nexperiments:\n"
+    text = "profile: smoke\noverrides: [method=robust, encoder=vgg19_random]\nexperiments:\n"
     text += '  - {name: a, overrides: [source=torus, style=rail, "style.path=null,ring.ply"]}\n'
     write_plan(tmp_path, text)
     done = sweep("plan.yaml", "--folder", "out", cwd=tmp_path)
@@ -375,8 +375,10 @@ SPEC = Spec("deadly", "kills its process", Options, make)
 def test_a_job_that_kills_its_process_each_time_fails_and_the_others_go_on(tmp_path):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="needs the extra sweep")
     (tmp_path / "deadly.py").write_text(DEADLY)
-    text = "profile: smoke\noverrides: [encoder=vgg19_random]\nexperiments:\n  - name: a\n"
-    text += "    overrides: [source=torus, style=rail, 'renderer=deadly,soft_raster']\n"
+    text = "profile: smoke\noverrides: [method=robust, encoder=vgg19_random]\nexperiments:\n"
+    text += (
+        "  - name: a\n    overrides: [source=torus, style=rail, 'renderer=deadly,soft_raster']\n"
+    )
     write_plan(tmp_path, text)
     plugin = {"STYLEEXP_PLUGINS": "renderer=deadly:SPEC", "PYTHONPATH": str(tmp_path)}
     done = sweep("plan.yaml", "--launcher", "joblib", "--folder", "out", cwd=tmp_path, **plugin)

@@ -14,7 +14,13 @@ from unittest import mock
 import numpy as np
 from corpus import REFUSED, REPAIRED, WORKS, Case, pixels
 
-OVERRIDES = ("profile=smoke", "encoder=vgg19_random", "optim.steps=1", "preview.resolution=48")
+OVERRIDES = (
+    "method=robust",
+    "profile=smoke",
+    "encoder=vgg19_random",
+    "optim.steps=1",
+    "preview.resolution=48",
+)
 
 
 @functools.cache

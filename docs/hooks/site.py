@@ -137,7 +137,8 @@ def configuration():
     out = [
         "# Configuration",
         "Every key of a run, as `styleexp KEY=VALUE` takes it, with the default of the schema. "
-        "Presets (`method=`, `profile=`, `layers=`, …) set others; `styleexp --help` shows the "
+        "Presets (`method=`, `profile=`, `layers=`, …) set others: `method=synthesis`, which every "
+        "run starts from, sets `baseline` and `source.refine=auto`. `styleexp --help` shows the "
         "values that a choice of them gives. This page is made from "
         "`styleexp/config.py` and the options of the registered parts when the site is built.",
     ]

@@ -221,13 +221,14 @@ HELP_TEMPLATE = """\
 ${hydra.help.header}
   styleexp critter bubble
   styleexp my.obj her.ply
-  styleexp critter peeling.jpg profile=fast
+  styleexp critter peeling.jpg strength=0.5
+  styleexp my.obj her.ply method=robust profile=fast
   styleexp method=paper encoder=vgg19 field.sigma=5 source=critter style=stripe
   styleexp resume=outputs/spot-bubble/2026-01-31_12-00-00
 
 Choices (group=option):
 $APP_CONFIG_GROUPS
-Keys, with their values for these choices (key=value, e.g. optim.steps=50):
+Keys, with their values for these choices (key=value, e.g. style.scale=2):
 $CONFIG
 The run's folder: hydra.run.dir=FOLDER. Tracebacks: debug=true. Completion:
 eval "$$(styleexp -sc install=bash)". Hydra's own flags: --hydra-help

@@ -1,8 +1,10 @@
 """The configuration schema: every choice of an experiment, with its meaning.
 
-Hydra validates against these dataclasses. The defaults are the ``robust`` method's; ``conf/method``
-holds the presets and ``conf/profile`` the sizes. Section and equation numbers are the paper's.
-This module imports nothing heavy: ``styleexp --help`` reads it.
+Hydra validates against these dataclasses. Their defaults are those of ``method=robust``. The
+command line and ``styleexp.stylize(...)`` start from ``conf/config.yaml``, whose
+``method=synthesis`` sets ``baseline`` and ``source.refine``; ``conf/method`` holds the presets and
+``conf/profile`` the sizes. Section and equation numbers are the paper's. This module imports
+nothing heavy: ``styleexp --help`` reads it.
 """
 
 from __future__ import annotations
@@ -294,8 +296,8 @@ class Config:
     shading: ShadingConfig = option(default_factory=ShadingConfig)
     loss: LossConfig = option(default_factory=LossConfig)
     baseline: Any = None
-    """Another method instead of this one, to compare with; null is the method of `stylize`. Its own
-    options, with its registered ``name``; ``conf/method`` sets it."""
+    """A method without this package's loop of learning, such as ``synthesis``; null learns, as
+    `stylize` does. Its own options, with its registered ``name``; ``conf/method`` sets it."""
     optim: OptimConfig = option(default_factory=OptimConfig)
     preview: PreviewConfig = option(default_factory=PreviewConfig)
     metrics: MetricsConfig = option(default_factory=MetricsConfig)

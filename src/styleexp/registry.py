@@ -35,3 +35,7 @@ class Spec:
     """Top-level import names of packages that it needs and that may be missing."""
     extra: str | None = None
     """The extra of its own distribution that brings them."""
+    reads: tuple[str, ...] | None = None
+    """Of a baseline: the keys that it reads, besides its own options and what every run reads
+    (`styleexp.unread`); a key stands for all below it. A run says of the others that are given that
+    they have no effect. None: not known."""

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from styleexp import baselines, meshes, plugins, process, sources
+from styleexp import baselines, meshes, plugins, process, sources, unread
 from styleexp.compose import compose
 from styleexp.errors import UserError
 from styleexp.explain import explain
@@ -128,8 +128,8 @@ def stylize(source: MeshLike, style: MeshLike | np.ndarray, *overrides: str) -> 
             ``trimesh.Trimesh``, or ``(vertices, faces)`` of shapes (vertices, 3) and (faces, 3).
         style: the same, or a picture of shape (height, width) or (height, width, channels), row 0
             at the top: integers of 8 or 16 bits, or floats in [0, 1].
-        overrides: those of the command line: ``stylize("my.obj", "bubble", "profile=fast",
-            "field.sigma=3")``.
+        overrides: those of the command line: ``stylize("my.obj", "bubble", "strength=0.5",
+            "style.scale=2")``.
 
     Returns:
         The generated mesh. Nothing is written; ``save`` writes it.
@@ -139,13 +139,16 @@ def stylize(source: MeshLike, style: MeshLike | np.ndarray, *overrides: str) -> 
 
     Warns:
         UserWarning: of repairs, of vertices left out or joined (the result's vertices are then not
-            the given ones; its faces are), of a mesh too coarse: what the command line notes.
+            the given ones; its faces are), of a mesh too coarse, of overrides that the method
+            doesn't read: what the command line notes.
 
     The process is left as it was: torch's number of threads (``threads=`` holds for this call) and
     its random numbers, and everything of a Hydra application that calls this.
     """
     config, given = configured(source, style, overrides)
     with sources.given(**given), process.undisturbed(config):
+        if (told := unread.note([config], overrides)) is not None:
+            warnings.warn(told, stacklevel=2)
         method = baselines.method(config)
         scene = method.prepare(config)
         for note in scene.notes:

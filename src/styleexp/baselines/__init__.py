@@ -1,4 +1,5 @@
-"""The methods compared against (Sec. 4.2.3), run by the same command into the same run folder.
+"""The methods beside the learned one: synthesis, the default, and those that the paper compares
+with (Sec. 4.2.3), run by the same command into the same run folder.
 
 A baseline is what `styleexp.stylize` is, the four functions of a `Method`: the command line and
 ``styleexp.stylize(...)`` call nothing else of either. ``config.baseline`` names it, ``conf/method``
@@ -46,7 +47,7 @@ class Method(Protocol):
 
 
 def method(config: Config) -> Method:
-    """The baseline that ``config`` names, or the method of the paper."""
+    """The baseline that ``config`` names, or the learned method."""
     from styleexp import plugins  # which lists the baselines, so it can't be imported above
 
     if config.baseline is None:

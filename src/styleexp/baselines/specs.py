@@ -27,7 +27,7 @@ class DisplacementMapConfig:
 
 @dataclass
 class SynthesisConfig:
-    """The style's relief laid on by example; see docs/synthesis.md."""
+    """The style's relief laid on by example, the default; see docs/synthesis.md."""
 
     name: str = "synthesis"
     bank: int = 10_000
@@ -74,23 +74,27 @@ def _synthesis(config: SynthesisConfig) -> Method:
     return Synthesis(config)
 
 
+# field.sigma tells how far source.refine=auto goes.
 BASELINES: dict[str, Spec] = {
     "displacement_map": Spec(
         "displacement_map",
         "a height map of the style laid on by triplanar projection: no learning, no steps",
         DisplacementMapConfig,
         _displacement_map,
+        reads=("field.sigma",),
     ),
     "geometric_textures": Spec(
         "geometric_textures",
         "a GAN on triangles, level by level (Hertz et al. 2020); mesh styles only",
         GeometricTexturesConfig,
         _geometric_textures,
+        reads=("field.sigma", "optim.steps", "optim.rate", "optim.checkpoint_every"),
     ),
     "synthesis": Spec(
         "synthesis",
         "the relief laid on by example, patch by patch (texture synthesis on the surface): seconds",
         SynthesisConfig,
         _synthesis,
+        reads=("field.sigma", "field.unfold"),
     ),
 }

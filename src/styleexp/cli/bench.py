@@ -56,8 +56,8 @@ def _parser() -> argparse.ArgumentParser:
     step = commands.add_parser(
         "step",
         help="the parts of a step of an optimisation",
-        description="Takes the overrides of styleexp: styleexp-bench step source=critter "
-        "style=bubble profile=full threads=1.",
+        description="Takes the overrides of styleexp: styleexp-bench step method=robust "
+        "source=critter style=bubble profile=full threads=1.",
     )
     step.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="as for styleexp")
     step.add_argument("--steps", type=int, default=10)

@@ -20,8 +20,9 @@ usage: styleexp SOURCE STYLE [KEY=VALUE ...]
 Put the local geometry of STYLE, a mesh or a picture, onto the mesh SOURCE. Both are files or names.
 
   styleexp critter bubble                 analytic shapes, always there
-  styleexp my.obj her.ply profile=fast    files; a smaller, faster run
+  styleexp my.obj her.ply                 files
   styleexp my.obj bark.jpg strength=0.5   a picture as style, half as high
+  styleexp my.obj her.ply method=robust   learned from renders, as in the paper: slower
   styleexp resume=FOLDER                  go on with a run that was stopped
 
 styleexp --help lists all keys and choices, styleexp-assets list the names.
@@ -131,7 +132,7 @@ def _job(config: DictConfig) -> float | None:
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import OmegaConf
 
-    from styleexp import compose
+    from styleexp import compose, unread
     from styleexp.cli.run import run
     from styleexp.errors import UserError
     from styleexp.sweeps import launchers, objective
@@ -148,6 +149,8 @@ def _job(config: DictConfig) -> float | None:
         folder = Path(runtime.runtime.output_dir)
         # As they are in Hydra's grammar: resolved, an escaped "${" in a file's name would be lost.
         given: Any = OmegaConf.to_container(runtime.overrides.task, resolve=False)
+        if not numbered and (told := unread.note([typed], given)):  # of a sweep: `sweeps.claim`
+            print(f"note: {told}")
         with chdir(runtime.runtime.cwd):  # hydra.job.chdir leaves what was typed as it was meant
             code = run(typed, folder, given, again=not numbered)
     except UserError as error:

@@ -136,9 +136,10 @@ def _guarded(
             raise
         asked = re.search(r"allocate (\d+) bytes", str(error))
         more = f" ({int(asked[1]) / 1e6:.0f} MB more could not be had)" if asked else ""
+        views = "fewer or smaller views (views.count, views.resolution), "
         told = (
-            f"there is not enough memory for this run{more}: take fewer or smaller views "
-            "(views.count, views.resolution), a mesh with fewer faces, or fewer runs at once."
+            f"there is not enough memory for this run{more}: take "
+            f"{'' if config.baseline else views}a mesh with fewer faces, or fewer runs at once."
         )
         _fail(folder, told)
         raise UserError(told) from error

@@ -165,10 +165,11 @@ def _status(folder: Path) -> int:
         state = "waiting" if state == "missing" else state
         counts[state] += 1
         seconds, total = run["seconds"], run.get("config.optim.steps")
+        taken = runs.steps(folder / name)
         table.add_row(
             name,
             state,
-            f"{runs.steps(folder / name)}/{total}" if total else "",
+            f"{taken}/{total}" if taken and total else "",
             str(known.get("attempts", 0)),
             f"{seconds:.0f} s" if isinstance(seconds, int | float) else "",
         )

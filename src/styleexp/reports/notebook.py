@@ -70,10 +70,13 @@ def caution(frame: pandas.DataFrame) -> str:
     if len(not_done):
         counts = ", ".join(f"{n} {state}" for state, n in not_done["status"].value_counts().items())
         told.append(f"{len(not_done)} of {len(frame)} runs are not there: {counts}.")
-    encoders = frame.get("config.encoder.name")
+    learned = frame
+    if "config.baseline.name" in frame:
+        learned = frame[frame["config.baseline.name"].isna()]
+    encoders = learned.get("config.encoder.name")
     if encoders is not None and (encoders == RANDOM).any():
         told.append("The encoder has random weights: nothing here says anything about style.")
-    steps = frame.get("config.optim.steps")
+    steps = learned.get("config.optim.steps")
     if steps is not None and steps.dropna().max() < 100:
         told.append(f"The runs have {steps.dropna().max():g} steps, the paper's 1000.")
     if "seed" in frame and frame["seed"].nunique() == 1:

@@ -106,9 +106,8 @@ def facts(run: Run, shown: Shown) -> list[tuple[str, str]]:
     found = [("status", run.state)]
     if asked := [each for each in run.overrides if not each.lstrip("+~").startswith("hydra.")]:
         found.append(("asked for", " ".join(asked)))
-    baseline = run.config.get("baseline.name")
-    if baseline:
-        found.append(("method", f"{baseline} (a baseline)"))
+    if run.config:
+        found.append(("method", str(run.config.get("baseline.name") or "learned")))
     if run.seconds is not None:
         found.append(("time", html.duration(run.seconds)))
     if run.steps:

@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from styleexp import locks
+from styleexp import locks, unread
 from styleexp.errors import UserError
 from styleexp.overrides import quote
 from styleexp.records import RunFolder
@@ -23,6 +23,8 @@ from styleexp.sweeps.jobs import JOBS, Job, listed, product
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
+
+    from styleexp.config import Config
 
 PATIENCE = 2.0
 """Seconds to wait for a folder: who only looks whether it is held, holds it for a moment."""
@@ -43,7 +45,8 @@ def sweep(config: DictConfig) -> Path:
     """
     folder = _claim(config, "sweep")
     try:
-        jobs = _jobs(config, folder)
+        configs: list[Config] = []
+        jobs = _jobs(config, folder, configs)
         content: dict[str, Any] = {"search": _search(config)}
         if jobs is not None:
             content = {"jobs": [job.overrides for job in jobs], "keys": [job.key for job in jobs]}
@@ -52,6 +55,8 @@ def sweep(config: DictConfig) -> Path:
         locks.drop(folder)
         raise
     RunFolder(folder).write_json(JOBS, content)
+    if told := unread.note(configs, _given(config)):
+        print(f"note: {told}", flush=True)
     return folder
 
 
@@ -106,8 +111,9 @@ def _names(folder: Path) -> Iterator[Path]:
         yield folder.with_name(f"{folder.name}_{number}")
 
 
-def _jobs(config: DictConfig, folder: Path) -> list[Job] | None:
-    """The sweep's jobs with their keys; None where the sweeper finds them as it goes."""
+def _jobs(config: DictConfig, folder: Path, configs: list[Config]) -> list[Job] | None:
+    """The sweep's jobs with their keys; None where the sweeper finds them as it goes. Their
+    configurations are appended to ``configs``."""
     from hydra.core.global_hydra import GlobalHydra
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import open_dict
@@ -128,7 +134,8 @@ def _jobs(config: DictConfig, folder: Path) -> list[Job] | None:
                 composed.hydra.job.id = composed.hydra.job.num = number
                 HydraConfig.instance().set_config(composed)
                 del composed["hydra"]
-            key = identity.job_key(compose.typed(composed))
+            configs.append(compose.typed(composed))
+            key = identity.job_key(configs[-1])
         jobs.append(Job(str(number), tuple(overrides), folder / str(number), key))
     HydraConfig.instance().cfg = before
     return jobs
