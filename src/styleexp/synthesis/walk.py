@@ -80,26 +80,23 @@ class Sheet:
         count, half = len(start), side // 2
         points, carried = (np.empty((count, side, side, 3)) for _ in range(2))
         nears = np.empty((count, side, side), dtype=np.int64)
-        parts = points, carried, nears
         points[:, half, half], carried[:, half, half] = self.vertices[start], ahead
         nears[:, half, half] = start
         for sign in (1, -1):
-            state = self.vertices[start], ahead, start
-            for row in range(1, half + 1):
-                state = self.step(*state, (sign * spacing, 0.0))
-                for each, part in zip(parts, state, strict=True):
-                    each[:, half - sign * row, half] = part
+            at, up, near = self.vertices[start], ahead, start
+            for row in range(half - sign, -1 if sign > 0 else side, -sign):
+                at, up, near = self.step(at, up, near, (sign * spacing, 0.0))
+                points[:, row, half], carried[:, row, half], nears[:, row, half] = at, up, near
         # All rows at once: a step costs little more for many points than for few.
+        rows = count, side
         for sign in (1, -1):
-            state = (
-                points[:, :, half].reshape(-1, 3),
-                carried[:, :, half].reshape(-1, 3),
-                nears[:, :, half].ravel(),
-            )
-            for column in range(1, half + 1):
-                state = self.step(*state, (0.0, sign * spacing))
-                for each, part in zip(parts, state, strict=True):
-                    each[:, :, half + sign * column] = part.reshape(each[:, :, half].shape)
+            at, up = points[:, :, half].reshape(-1, 3), carried[:, :, half].reshape(-1, 3)
+            near = nears[:, :, half].ravel()
+            for column in range(half + sign, side if sign > 0 else -1, sign):
+                at, up, near = self.step(at, up, near, (0.0, sign * spacing))
+                points[:, :, column] = at.reshape(*rows, 3)
+                carried[:, :, column] = up.reshape(*rows, 3)
+                nears[:, :, column] = near.reshape(rows)
         return points, nears, carried
 
     def on_the_mesh(
