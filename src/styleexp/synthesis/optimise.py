@@ -155,9 +155,8 @@ def synthesise(
         weight = _gaussian(side, VOTE)
         known = bank(exemplar.sample(most, side, level.spacing, rng, any_way)[0])
         middle = sheet.spread(density * level.spacing * unit, rng)
-        points, nears, _ = sheet.grids(middle, ahead[middle], side, level.spacing * unit)
-        sample = sheet.interpolation(points.reshape(-1, 3), nears.ravel())
-        spread = sample.T.tocsr()
+        sample = sheet.sampling(middle, ahead[middle], side, level.spacing * unit)
+        spread = sample.T
         quilted = laid.patches(torch.from_numpy(middle), side, level.spacing)
         compared = known.compared(quilted)
         best: Tensor | None = None

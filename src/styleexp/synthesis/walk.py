@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_matrix, vstack
 from scipy.spatial import cKDTree
 
 from styleexp import meshes
@@ -20,6 +20,8 @@ AT_ONCE = 16_000
 """Points interpolated at once: what they need then fits a cache."""
 THREADED = 10_000
 """Points from which on they are looked up on all cores."""
+GRIDS = 20_000
+"""Grids that are walked at once: what they need is a part of what they become."""
 MOST_FACES = 24
 """Faces round a vertex that are looked at; a vertex with more of them is a pole of a fan."""
 
@@ -98,6 +100,20 @@ class Sheet:
                 carried[:, :, column] = up.reshape(*rows, 3)
                 nears[:, :, column] = near.reshape(rows)
         return points, nears, carried
+
+    def sampling(
+        self,
+        start: Int[np.ndarray, " grids"],
+        ahead: Float[np.ndarray, "grids 3"],
+        side: int,
+        spacing: float,
+    ) -> csr_matrix:
+        """The matrix, (grids x cells, vertices), that samples values of the vertices by `grids`."""
+        parts = []
+        for some in np.array_split(np.arange(len(start)), len(start) // GRIDS + 1):
+            points, nears, _ = self.grids(start[some], ahead[some], side, spacing)
+            parts.append(self.interpolation(points.reshape(-1, 3), nears.ravel()))
+        return vstack(parts, format="csr")
 
     def on_the_mesh(
         self, points: Float[np.ndarray, "... 3"], nears: Int[np.ndarray, ...]
