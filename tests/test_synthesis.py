@@ -8,7 +8,8 @@ import torch
 import trimesh
 
 import styleexp
-from styleexp import meshes, shapes
+from styleexp import meshes, scene, shapes
+from styleexp.compose import compose
 from styleexp.errors import UserError
 from styleexp.metrics.patches import relief_of_mesh
 from styleexp.synthesis.direction import FLOW, UP, direction_field, turned
@@ -257,3 +258,14 @@ def test_strength_zero_gives_the_source_back_and_no_face_turns_over(striped):
 def test_what_can_not_be_laid_is_said_in_one_sentence(style, options, told):
     with pytest.raises(UserError, match=told):
         styleexp.stylize("torus", style, *CHEAP, *options)
+
+
+def test_learning_can_start_at_the_synthesis():
+    """Before the first step it is what ``method=synthesis`` makes."""
+    made = styleexp.stylize("torus", "stripe", "source.refine=none", "field.unfold=false")
+    subject = scene.load(
+        compose(["method=robust", "source=torus", "style=stripe", "field.start=synthesis"])
+    )
+    base, notes = scene.start_of(subject)
+    assert not notes
+    assert np.allclose(base.numpy() * subject.frame.scale, made.displacement, atol=1e-6)

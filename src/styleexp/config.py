@@ -114,9 +114,10 @@ class FieldConfig:
     wavelength. The paper has 0.1."""
     start: str = "map"
     """What the field's displacement is added to. ``map``: the style's height map, laid on by
-    triplanar projection (`styleexp.height_maps`). ``source``: nothing, as in the paper."""
+    triplanar projection (`styleexp.height_maps`). ``synthesis``: what ``method=synthesis`` makes.
+    ``source``: nothing, as in the paper."""
     learned: float = 0.25
-    """``start=map``: how much of the bound the learned part may use, 0 to 1."""
+    """Unless ``start=source``: how much of the bound the learned part may use, 0 to 1."""
     zero_mean: bool = True
     """Subtract the area-weighted mean displacement, so that the mesh can't shrink as a whole."""
     unfold: bool = True
@@ -321,7 +322,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "style.scale_by": ("area", "frame"),
     "style.kind": ("auto", "photo", "height", "normal", "normal_dx"),
     "views.spread": ("normal", "around"),
-    "field.start": ("map", "source"),
+    "field.start": ("map", "source", "synthesis"),
     "views.local.mode": ("image", "zoom", "surface"),
     "views.local.crop": ("side", "area"),
     "shading.normals": ("flat", "smooth"),
@@ -438,10 +439,14 @@ def _check_placing(config: Config) -> None:
             f"style.direction={style.direction} is not allowed: give {', '.join(DIRECTIONS)} or "
             "attribute:NAME."
         )
-    if method in (None, "displacement_map", "geometric_textures"):
+    learned = method is None and config.field.start != "synthesis"
+    if learned or method in ("displacement_map", "geometric_textures"):
         for key, plain in (("direction", "auto"), ("rotation", 0)):
             if (value := getattr(style, key)) != plain:
-                raise UserError(f"style.{key}={value} needs method=synthesis: no other reads it.")
+                raise UserError(
+                    f"style.{key}={value} needs method=synthesis or "
+                    "field.start=synthesis: nothing else reads it."
+                )
     if method is None and (style.invert or style.kind not in ("auto", "photo")):
         given = "style.invert=true" if style.invert else f"style.kind={style.kind}"
         raise UserError(

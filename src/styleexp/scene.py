@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from styleexp import height_maps, masks, meshes, pictures, remembered, styles
+from styleexp.baselines.specs import SynthesisConfig
 from styleexp.config import check
 from styleexp.errors import UserError
 from styleexp.geometry import Surface, vertex_areas
@@ -239,6 +240,10 @@ def start_of(subject: Subject) -> tuple[Tensor | None, list[str]]:
     """What the field is added to (``field.start``), and what to tell the user about it."""
     if subject.config.field.start == "source":
         return None, []
+    if subject.config.field.start == "synthesis":
+        from styleexp.synthesis.method import relief
+
+        return relief(subject, SynthesisConfig().bank, 1.0).float(), []
     try:
         return height_maps.displacement(subject), []
     except height_maps.NoPatch:

@@ -28,6 +28,7 @@ from styleexp.synthesis.walk import Sheet
 
 if TYPE_CHECKING:
     from jaxtyping import Float
+    from torch import Tensor
 
     from styleexp.baselines.specs import SynthesisConfig
     from styleexp.config import Config
@@ -70,35 +71,41 @@ class Synthesis:
 
     def finish(self, scene: Subject, state: None) -> Result:
         """Displace the source by the relief; zero on average over the surface."""
-        rng = np.random.default_rng(scene.config.optim.seed)
-        doing("telling the style's relief from its shape")
-        exemplar = exemplar_of_style(scene)
-        pattern = measure(exemplar, rng)
-        _check(scene, pattern)
         surface = scene.surface
-        sheet = Sheet(
-            surface.vertices.cpu().numpy(), scene.source.faces, surface.normals.cpu().numpy()
-        )
-        directed = pattern.directed > DIRECTED
-        ahead = directions(scene, sheet, directed)
-        levels = levels_of(pattern, sheet.edge / scene.unit)
-        print(told(scene, pattern, directed, levels), flush=True)
-
-        height = torch.zeros(len(sheet.vertices))
-        total = sum(level.rounds for level in levels)
-        for number, height in synthesise(  # noqa: B007  the last is the result
-            sheet, ahead, exemplar, levels, scene.unit, not directed, rng, most=self.config.bank
-        ):
-            doing(f"laying the relief, round {number} of {total}")
-        displacement = height.double() * scene.unit * scene.config.strength
-        displacement *= torch.from_numpy(fade(sheet, half_range(displacement.numpy())))
-        displacement = zero_mean(displacement, scene.weights.cpu().double(), math.inf)
+        displacement = relief(scene, self.config.bank, scene.config.strength)
         displacement = masked(displacement, scene.mask)
         if scene.config.field.unfold:
-            displacement = unfolded(surface, displacement.to(surface.vertices.device)).cpu()
-        moved = displacement.numpy() * scene.frame.scale
+            displacement = unfolded(surface, displacement)
+        moved = displacement.cpu().numpy() * scene.frame.scale
         offset = moved[:, None] * surface.normals.double().cpu().numpy()
         return Result(scene, moved, scene.source.vertices + offset)
+
+
+def relief(scene: Subject, bank: int, strength: float) -> Float[Tensor, " vertices"]:
+    """The style's relief on the source's vertices, ``strength`` times as high, in radii of the
+    normalised source; zero on average over the surface. ``bank`` is `SynthesisConfig`'s."""
+    rng = np.random.default_rng(scene.config.optim.seed)
+    doing("telling the style's relief from its shape")
+    exemplar = exemplar_of_style(scene)
+    pattern = measure(exemplar, rng)
+    _check(scene, pattern)
+    surface = scene.surface
+    sheet = Sheet(surface.vertices.cpu().numpy(), scene.source.faces, surface.normals.cpu().numpy())
+    directed = pattern.directed > DIRECTED
+    ahead = directions(scene, sheet, directed)
+    levels = levels_of(pattern, sheet.edge / scene.unit)
+    print(told(scene, pattern, directed, levels), flush=True)
+
+    height = torch.zeros(len(sheet.vertices))
+    total = sum(level.rounds for level in levels)
+    for number, height in synthesise(  # noqa: B007  the last is the result
+        sheet, ahead, exemplar, levels, scene.unit, not directed, rng, most=bank
+    ):
+        doing(f"laying the relief, round {number} of {total}")
+    displacement = height.double() * scene.unit * strength
+    displacement *= torch.from_numpy(fade(sheet, half_range(displacement.numpy())))
+    displacement = zero_mean(displacement, scene.weights.cpu().double(), math.inf)
+    return displacement.to(surface.vertices.device)
 
 
 def directions(scene: Subject, sheet: Sheet, directed: bool) -> Float[np.ndarray, "vertices 3"]:
