@@ -243,7 +243,7 @@ def start_of(subject: Subject) -> tuple[Tensor | None, list[str]]:
     if subject.config.field.start == "synthesis":
         from styleexp.synthesis.method import relief
 
-        return relief(subject, SynthesisConfig().bank, 1.0).float(), []
+        return relief(subject, SynthesisConfig(), 1.0).float(), []
     try:
         return height_maps.displacement(subject), []
     except height_maps.NoPatch:

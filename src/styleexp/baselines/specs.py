@@ -32,6 +32,9 @@ class SynthesisConfig:
     name: str = "synthesis"
     bank: int = 10_000
     """Patches that are taken of the style at each scale."""
+    flatten: float = 0.0
+    """Share of the source's own relief, 0 to 1, that is taken off where it is as fine as the
+    pattern: for a source whose bumps hide it."""
 
 
 @dataclass

@@ -15,7 +15,7 @@ from styleexp.errors import UserError
 from styleexp.fields import zero_mean
 from styleexp.geometry import unfolded
 from styleexp.masks import masked
-from styleexp.relief import half_range, smoother
+from styleexp.relief import half_range, mesh_relief, smoother
 from styleexp.scene import load
 from styleexp.stages import doing
 from styleexp.stylize import Result, Step
@@ -57,6 +57,8 @@ class Synthesis:
         self.config = config
         if not 500 <= config.bank <= 200_000:
             raise UserError(f"baseline.bank={config.bank} is not allowed: give 500 to 200000.")
+        if not 0 <= config.flatten <= 1:
+            raise UserError(f"baseline.flatten={config.flatten} is not allowed: give 0 to 1.")
 
     def prepare(self, config: Config) -> Subject:
         """Source and style; neither renderer nor encoder."""
@@ -72,7 +74,7 @@ class Synthesis:
     def finish(self, scene: Subject, state: None) -> Result:
         """Displace the source by the relief; zero on average over the surface."""
         surface = scene.surface
-        displacement = relief(scene, self.config.bank, scene.config.strength)
+        displacement = relief(scene, self.config, scene.config.strength)
         displacement = masked(displacement, scene.mask)
         if scene.config.field.unfold:
             displacement = unfolded(surface, displacement)
@@ -81,9 +83,9 @@ class Synthesis:
         return Result(scene, moved, scene.source.vertices + offset)
 
 
-def relief(scene: Subject, bank: int, strength: float) -> Float[Tensor, " vertices"]:
+def relief(scene: Subject, config: SynthesisConfig, strength: float) -> Float[Tensor, " vertices"]:
     """The style's relief on the source's vertices, ``strength`` times as high, in radii of the
-    normalised source; zero on average over the surface. ``bank`` is `SynthesisConfig`'s."""
+    normalised source; zero on average over the surface."""
     rng = np.random.default_rng(scene.config.optim.seed)
     doing("telling the style's relief from its shape")
     exemplar = exemplar_of_style(scene)
@@ -99,11 +101,17 @@ def relief(scene: Subject, bank: int, strength: float) -> Float[Tensor, " vertic
     height = torch.zeros(len(sheet.vertices))
     total = sum(level.rounds for level in levels)
     for number, height in synthesise(  # noqa: B007  the last is the result
-        sheet, ahead, exemplar, levels, scene.unit, not directed, rng, most=bank
+        sheet, ahead, exemplar, levels, scene.unit, not directed, rng, most=config.bank
     ):
         doing(f"laying the relief, round {number} of {total}")
     displacement = height.double() * scene.unit * strength
     displacement *= torch.from_numpy(fade(sheet, half_range(displacement.numpy())))
+    if config.flatten:
+        own = mesh_relief(
+            sheet.vertices, sheet.faces, sheet.normals, pattern.wavelength * scene.unit
+        )
+        most = float(displacement.abs().max())
+        displacement -= config.flatten * torch.from_numpy(own.clip(-most, most))
     displacement = zero_mean(displacement, scene.weights.cpu().double(), math.inf)
     return displacement.to(surface.vertices.device)
 
