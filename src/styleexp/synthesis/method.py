@@ -46,6 +46,8 @@ ROUNDS = (10, 6, 3)
 """Of the levels, from coarse to fine."""
 FLAT = 1e-4
 """A relief lower than this, in units of the pattern, is none."""
+EVEN = 1.5
+"""Edges: what is finer is taken off the relief, or steep walls between them would be saws."""
 ROOM = 0.6
 """The relief may take up this share of the room inside and outside the surface."""
 
@@ -104,7 +106,9 @@ def relief(scene: Subject, config: SynthesisConfig, strength: float) -> Float[Te
         sheet, ahead, exemplar, levels, scene.unit, not directed, rng, most=config.bank
     ):
         doing(f"laying the relief, round {number} of {total}")
-    displacement = height.double() * scene.unit * strength
+    even = smoother(sheet.vertices, sheet.faces, EVEN * sheet.edge)
+    height = torch.from_numpy(even(height.numpy()))
+    displacement = height * scene.unit * strength
     displacement *= torch.from_numpy(fade(sheet, half_range(displacement.numpy())))
     if config.flatten:
         own = mesh_relief(
