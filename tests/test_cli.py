@@ -118,6 +118,23 @@ def test_interrupt_checkpoints_and_says_how_to_go_on(tmp_path):
     assert (folder / "checkpoint.safetensors").exists()
 
 
+def test_an_interrupted_synthesis_says_how_to_run_it_again(tmp_path):
+    folder = tmp_path / "run"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "styleexp", "torus", "bubble", "source.refine=40000",
+         "report=false", f"hydra.run.dir={folder}"],
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    assert any("wavelength" in line for line in process.stdout)  # it is at work
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert f"stopped; run it again with: styleexp resume={folder}" in told
+    assert json.loads((folder / "status.json").read_text())["status"] == "interrupted"
+    assert not (folder / "result.ply").exists()
+
+
 def test_damaged_checkpoint_falls_back_to_the_one_before_and_says_so(finished, tmp_path):
     import shutil
 

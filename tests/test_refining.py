@@ -118,10 +118,21 @@ def test_too_many_faces_are_refused(monkeypatch):
 def test_a_run_refines_for_its_style_and_says_so():
     from styleexp import scene
 
-    plain = scene.load(compose(["source=sphere", "style=scales", "source.refine=none"]))
-    fine = scene.load(compose(["source=sphere", "style=scales"]))
+    sized = ["source=sphere", "style=scales", "style.scale=2"]
+    plain = scene.load(compose([*sized, "source.refine=none"]))
+    fine = scene.load(compose(sized))
     assert len(fine.source.faces) > len(plain.source.faces)
     longest = as_trimesh(fine.source).edges_unique_length.max() / fine.frame.scale
-    assert longest <= 1 / fine.sigma / scene.PER_WAVE
+    assert longest <= 1 / fine.sigma / scene.PER_WAVE * (1 + 1e-9)
     assert any("refined from" in note for note in fine.notes)
     assert not any("is coarse" in note for note in fine.notes)
+
+
+def test_a_run_refines_to_a_number_of_faces():
+    from styleexp import scene
+
+    wanted = 60_000
+    fine = scene.load(compose(["source=sphere", "style=scales", f"source.refine={wanted}"]))
+    assert 0.7 * wanted < len(fine.source.faces) < 1.4 * wanted
+    with pytest.raises(UserError, match=r"source\.refine=many is not allowed: give auto, none or"):
+        scene.load(compose(["source=sphere", "style=scales", "source.refine=many"]))

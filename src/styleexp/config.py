@@ -10,6 +10,7 @@ nothing heavy: ``styleexp --help`` reads it.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
 from dataclasses import field as option
@@ -33,8 +34,8 @@ class SourceConfig:
     """Remesh to about this many vertices first (attributes are lost); null keeps the mesh."""
     refine: str = "none"
     """``auto``: edges too long for the style's relief are halved until none is left, on the smooth
-    surface through the mesh; texture coordinates, materials and colours are kept. ``none``: the
-    mesh's own vertices and faces, as in the paper."""
+    surface through the mesh; texture coordinates, materials and colours are kept. A number: until
+    there are about so many faces. ``none``: the mesh's own vertices and faces, as in the paper."""
 
 
 @dataclass
@@ -317,7 +318,6 @@ class Config:
 
 
 CHOICES: dict[str, tuple[Any, ...]] = {
-    "source.refine": ("none", "auto"),
     "style.scale_by": ("area", "frame"),
     "style.kind": ("auto", "photo", "height", "normal", "normal_dx"),
     "views.spread": ("normal", "around"),
@@ -403,6 +403,12 @@ def check(config: Config) -> None:
         raise UserError(
             f"loss.block_weights={config.loss.block_weights} is not allowed: give five weights, "
             "one for each of VGG's blocks, none below 0."
+        )
+    refine = config.source.refine
+    if refine not in ("none", "auto") and not re.fullmatch(r"[1-9]\d{2,6}", refine):
+        raise UserError(
+            f"source.refine={refine} is not allowed: give auto, none or how many faces it should "
+            "have, from 100 to 9999999."
         )
     background = config.shading.background
     if background not in ("white", "black", "foreground"):

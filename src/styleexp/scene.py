@@ -48,10 +48,13 @@ PICTURE_DETAIL = 128
 """Pixels on a picture's longer side when its frequency is measured; finer detail doesn't count."""
 
 
-PER_WAVE = 10.0
-"""Of the longest edges, on a wavelength of the style's relief, where the source is refined."""
-MOST_REFINED = 250_000
+PER_WAVE = 12.0
+"""Of the longest edges, on a wavelength of the style's relief, where the source is refined: with
+half as many the grooves between bubbles are blurred."""
+MOST_REFINED = 200_000
 """Faces that refining aims at, at most."""
+SHORTER = 0.65
+"""Mean edge over the longest after refining, which halves edges."""
 STRAY = 5.0
 """A mesh has stray faces where a vertex is so many times farther off than 99 of 100 vertices."""
 
@@ -116,8 +119,8 @@ def load(config: Config) -> Subject:
     if heights is not None and heights.in_proportion:
         height = pictures.spread(heights.height) * height_maps.picture_side(config, unit) / size
         bound = BOUND_MARGIN * height if config.field.bound is None else bound
-    if config.source.refine == "auto":
-        source = refined(source, size / sigma)
+    if config.source.refine != "none":
+        source = refined(source, size / sigma, config.source.refine)
     frame, surface = normalised(source, device)
     areas = vertex_areas(surface)
     mask, told = placed(config.style, source, areas)
@@ -283,14 +286,15 @@ def choose_field(
     return sigma, bound, height
 
 
-def refined(mesh: meshes.Mesh, wavelength: float) -> meshes.Mesh:
-    """The mesh with edges short enough for a relief of this wavelength, in radii; fewer than that
-    needs where it would take more than `MOST_REFINED` faces."""
+def refined(mesh: meshes.Mesh, wavelength: float, how: str) -> meshes.Mesh:
+    """The mesh with edges short enough for a relief of this wavelength, in radii. ``how`` is
+    ``source.refine``: a number of faces that is aimed at, or ``auto``, at most `MOST_REFINED`."""
     scale = meshes.normalisation(mesh.vertices).scale
     area = meshes.face_areas(mesh.vertices, mesh.faces).sum()
-    # Halving leaves edges between half of the longest and that: about 0.75 of it on average.
-    affordable = math.sqrt(area / (MOST_REFINED * math.sqrt(3) / 4)) / 0.75
-    longest = max(wavelength / PER_WAVE * scale, affordable)
+    faces = MOST_REFINED if how == "auto" else float(how)
+    longest = math.sqrt(area / (faces * math.sqrt(3) / 4)) / SHORTER
+    if how == "auto":
+        longest = max(wavelength / PER_WAVE * scale, longest)
     doing("refining the source for the style")
     return meshes.refine(mesh, longest)
 

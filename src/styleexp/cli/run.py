@@ -129,6 +129,9 @@ def _guarded(
     except KeyboardInterrupt:
         if folder.begun:
             folder.write_status("interrupted", reason="stopped by the user")
+            again = shlex.join(["styleexp", f"resume={folder.path.absolute()}"])
+            with suppress(OSError):
+                print(f"\nstopped; run it again with: {again}", file=sys.stderr)
         raise
     except Exception as error:
         if not _out_of_memory(error):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from styleexp.stages import doing
 from styleexp.synthesis.quilting import quilt
 from styleexp.synthesis.walk import Sheet
 
@@ -143,6 +144,7 @@ def synthesise(
     ``ahead`` is which way the pattern's up points, ``unit`` the length of such a unit on the mesh,
     ``most`` the size of a level's bank.
     """
+    doing("covering the source with pieces of the style")
     first, last = levels[0], levels[-1]
     laid = quilt(sheet, ahead, exemplar, first.spacing, last.spacing, unit, any_way, rng)
     height = laid.heights()
@@ -153,9 +155,8 @@ def synthesise(
         weight = _gaussian(side, VOTE)
         known = bank(exemplar.sample(most, side, level.spacing, rng, any_way)[0])
         middle = sheet.spread(density * level.spacing * unit, rng)
-        points, nears, _ = sheet.grids(middle, ahead[middle], side, level.spacing * unit)
-        sample = sheet.interpolation(points.reshape(-1, 3), nears.ravel())
-        spread = sample.T.tocsr()
+        sample = sheet.sampling(middle, ahead[middle], side, level.spacing * unit)
+        spread = sample.T
         quilted = laid.patches(torch.from_numpy(middle), side, level.spacing)
         compared = known.compared(quilted)
         best: Tensor | None = None

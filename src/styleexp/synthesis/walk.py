@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_matrix, vstack
 from scipy.spatial import cKDTree
 
 from styleexp import meshes
@@ -16,8 +16,12 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
     from torch import Tensor
 
-AT_ONCE = 200_000
+AT_ONCE = 16_000
 """Points interpolated at once: what they need then fits a cache."""
+THREADED = 10_000
+"""Points from which on they are looked up on all cores."""
+GRIDS = 20_000
+"""Grids that are walked at once: what they need is a part of what they become."""
 MOST_FACES = 24
 """Faces round a vertex that are looked at; a vertex with more of them is a pole of a fan."""
 
@@ -39,7 +43,8 @@ class Sheet:
 
     def nearest(self, points: Float[np.ndarray, "points 3"]) -> Int[np.ndarray, " points"]:
         """The vertex nearest to each point."""
-        return self.tree.query(points, workers=-1)[1]
+        # Threads cost more than they save on few points.
+        return self.tree.query(points, workers=-1 if len(points) > THREADED else 1)[1]
 
     def step(
         self,
@@ -74,28 +79,41 @@ class Sheet:
         """Points of a grid of ``side`` x ``side`` (odd) round each start vertex, walked over the
         mesh: first along ``ahead``, then to both sides; row 0 lies ahead, column 0 to the left.
         With them the vertices nearest to them, and ``ahead`` as carried along."""
-        half = side // 2
-        points, carried = (np.empty((len(start), side, side, 3)) for _ in range(2))
-        nears = np.empty((len(start), side, side), dtype=np.int64)
-
-        def row(number: int, state: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
-            for sign in (1, -1):
-                at = state
-                for column in range(half + 1):
-                    if column:
-                        at = self.step(*at, (0.0, sign * spacing))
-                    place = number, half + sign * column
-                    for each, part in zip((points, carried, nears), at, strict=True):
-                        each[:, *place] = part
-
-        middle = self.vertices[start], ahead, start
-        row(half, middle)
+        count, half = len(start), side // 2
+        points, carried = (np.empty((count, side, side, 3)) for _ in range(2))
+        nears = np.empty((count, side, side), dtype=np.int64)
+        points[:, half, half], carried[:, half, half] = self.vertices[start], ahead
+        nears[:, half, half] = start
         for sign in (1, -1):
-            at = middle
-            for count in range(1, half + 1):
-                at = self.step(*at, (sign * spacing, 0.0))
-                row(half - sign * count, at)
+            at, up, near = self.vertices[start], ahead, start
+            for row in range(half - sign, -1 if sign > 0 else side, -sign):
+                at, up, near = self.step(at, up, near, (sign * spacing, 0.0))
+                points[:, row, half], carried[:, row, half], nears[:, row, half] = at, up, near
+        # All rows at once: a step costs little more for many points than for few.
+        rows = count, side
+        for sign in (1, -1):
+            at, up = points[:, :, half].reshape(-1, 3), carried[:, :, half].reshape(-1, 3)
+            near = nears[:, :, half].ravel()
+            for column in range(half + sign, side if sign > 0 else -1, sign):
+                at, up, near = self.step(at, up, near, (0.0, sign * spacing))
+                points[:, :, column] = at.reshape(*rows, 3)
+                carried[:, :, column] = up.reshape(*rows, 3)
+                nears[:, :, column] = near.reshape(rows)
         return points, nears, carried
+
+    def sampling(
+        self,
+        start: Int[np.ndarray, " grids"],
+        ahead: Float[np.ndarray, "grids 3"],
+        side: int,
+        spacing: float,
+    ) -> csr_matrix:
+        """The matrix, (grids x cells, vertices), that samples values of the vertices by `grids`."""
+        parts = []
+        for some in np.array_split(np.arange(len(start)), len(start) // GRIDS + 1):
+            points, nears, _ = self.grids(start[some], ahead[some], side, spacing)
+            parts.append(self.interpolation(points.reshape(-1, 3), nears.ravel()))
+        return vstack(parts, format="csr")
 
     def on_the_mesh(
         self, points: Float[np.ndarray, "... 3"], nears: Int[np.ndarray, ...]
@@ -131,9 +149,10 @@ class Sheet:
         return longest
 
     @cached_property
-    def _fans(self) -> tuple[Tensor, Tensor]:
-        """For each vertex the other two corners of the faces round it, (vertices, most, 2), and
-        what gives a point's coordinates along the two edges, (vertices, most, 2, 3)."""
+    def _fans(self) -> tuple[Tensor, Tensor, Int[np.ndarray, " vertices"]]:
+        """For each vertex the other two corners of the faces round it, (vertices, most, 2), what
+        gives a point's coordinates along the two edges, (vertices, most, 2, 3), and how many faces
+        there are."""
         count = len(self.vertices)
         corner = self.faces.ravel()
         order = np.argsort(corner, kind="stable")
@@ -151,29 +170,34 @@ class Sheet:
         largest = np.trace(gram, axis1=2, axis2=3)[..., None, None]
         gram += np.eye(2) * (1e-9 * largest + 1e-30)
         solve = np.linalg.solve(gram, edges)
-        return torch.from_numpy(others), torch.from_numpy(solve).float()
+        return torch.from_numpy(others), torch.from_numpy(solve).float(), valence.clip(1, most)
 
     def interpolation(
         self, points: Float[np.ndarray, "points 3"], nears: Int[np.ndarray, " points"]
     ) -> csr_matrix:
         """The matrix, (points, vertices), that interpolates values of the vertices at the points:
         linear on that face round the nearest vertex which a point lies in or nearest to."""
-        others, solve = self._fans
-        corners, weights = [], []
-        for at in range(0, len(points), AT_ONCE):
-            near = torch.from_numpy(nears[at : at + AT_ONCE])
-            offset = torch.from_numpy(points[at : at + AT_ONCE] - self.vertices[near.numpy()])
-            two = torch.einsum("pfad,pd->pfa", solve[near], offset.float())
-            inside = torch.minimum(two.amin(2), 1 - two.sum(2))
-            # A place of the table without a face has no edges, so its coordinates are zero.
-            inside = torch.where((others[near, :, 0] == near[:, None]), -torch.inf, inside)
-            best = inside.argmax(1)
-            rows = torch.arange(len(near))
-            share = two[rows, best].clamp(0, 1)
-            share = share / share.sum(1, keepdim=True).clamp(min=1)
-            corners.append(torch.cat([near[:, None], others[near, best]], 1))
-            weights.append(torch.cat([1 - share.sum(1, keepdim=True), share], 1))
-        column, weight = torch.cat(corners).numpy(), torch.cat(weights).numpy()
+        others, solve, valence = self._fans
+        column = torch.empty(len(points), 3, dtype=torch.int64)
+        weight = torch.empty(len(points), 3)
+        # Few vertices have many faces, which all others would have to wait for.
+        least = 0
+        for most in (6, 8, others.shape[1]):
+            rows = np.flatnonzero((valence[nears] > least) & (valence[nears] <= most))
+            least = most
+            for some in np.array_split(rows, len(rows) // AT_ONCE + 1):
+                near = torch.from_numpy(nears[some])
+                offset = torch.from_numpy(points[some] - self.vertices[nears[some]]).float()
+                fan = others[near, :most]
+                two = torch.einsum("pfad,pd->pfa", solve[near, :most], offset)
+                inside = torch.minimum(two.amin(2), 1 - two.sum(2))
+                # A place without a face has no edges, so its coordinates are zero.
+                inside = torch.where(fan[:, :, 0] == near[:, None], -torch.inf, inside)
+                best, at = inside.argmax(1), torch.arange(len(near))
+                share = two[at, best].clamp(0, 1)
+                share = share / share.sum(1, keepdim=True).clamp(min=1)
+                column[some] = torch.cat([near[:, None], fan[at, best]], 1)
+                weight[some] = torch.cat([1 - share.sum(1, keepdim=True), share], 1)
         begins = np.arange(len(points) + 1) * 3
         shape = (len(points), len(self.vertices))
-        return csr_matrix((weight.ravel(), column.ravel(), begins), shape)
+        return csr_matrix((weight.numpy().ravel(), column.numpy().ravel(), begins), shape)
