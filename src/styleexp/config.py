@@ -69,6 +69,9 @@ class StyleConfig:
     falloff: float = 0.05
     """Width of the mask's borders, in radii of the normalised source; half of it lies on each
     side. 0 leaves the mask as it is."""
+    relief_length: float | None = None
+    """Mesh styles (``method=synthesis``): what is smaller than this, in radii of the style, is its
+    relief, the rest its shape; null finds it."""
     kind: str = "auto"
     """What a picture's colours are. ``photo``: its tone is height, as high as its pattern's size
     suggests. ``height``: height in proportion, see ``image_depth``. ``normal``: the directions of a

@@ -28,6 +28,8 @@ from styleexp.viewer import Viewer
 from styleexp.views import orbit
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from jaxtyping import Float
     from torch import Tensor
 
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
     from styleexp.losses import Grams, StyleLoss
     from styleexp.renderers.base import Renderer
     from styleexp.styles import StyleTarget
+    from styleexp.synthesis.exemplar import MeshExemplar
 
 
 BOUND_MARGIN = 2.0
@@ -55,6 +58,8 @@ MOST_REFINED = 200_000
 """Faces that refining aims at, at most."""
 SHORTER = 0.65
 """Mean edge over the longest after refining, which halves edges."""
+FLAT = 1e-4
+"""A picture whose heights spread less is of one tone."""
 STRAY = 5.0
 """A mesh has stray faces where a vertex is so many times farther off than 99 of 100 vertices."""
 
@@ -80,6 +85,10 @@ class Subject:
     """Half the range of the style's own relief, in such radii."""
     heights: Heights | None = None
     """Of a picture; None for a mesh."""
+    example: MeshExemplar | None = None
+    """Of a mesh, for the method that lays the relief by example."""
+    smooth: bool = False
+    """Whether that method found no relief on the style."""
     mask: Float[Tensor, " vertices"] | None = None
     """Factor on the displacement, 0 to 1 (``style.mask``); None is 1 everywhere."""
     notes: tuple[str, ...] = ()
@@ -104,8 +113,11 @@ class Scene(Subject):
     """What the distances of the global and the local views are divided by, for each layer."""
 
 
-def load(config: Config) -> Subject:
-    """Load source and style, and measure the style."""
+def load(
+    config: Config, relief_of: Callable[[meshes.Mesh], MeshExemplar | None] | None = None
+) -> Subject:
+    """Load source and style, and measure the style. ``relief_of`` tells a style mesh's relief from
+    its shape, None where there is none; the source is then refined for that relief."""
     check(config)
     device = choose_device(config.device)
     source = load_source(config.source)
@@ -116,10 +128,19 @@ def load(config: Config) -> Subject:
     unit = pattern_unit(config.style, source, style if isinstance(style, meshes.Mesh) else None)
     sigma, bound, height = choose_field(config.field, style, heights, config.style.image_tile)
     size = 1.0 if config.style.scale_by == "frame" else unit
+    example, smooth = None, False
+    if relief_of is not None and isinstance(style, meshes.Mesh):
+        doing("telling the style's relief from its shape")
+        example = relief_of(style)
+        smooth = example is None
+        if example is not None and config.field.sigma is None:
+            sigma = min(max(example.frequency, 1.0), 10.0)
+    elif relief_of is not None and heights is not None:
+        smooth = pictures.spread(heights.height) < FLAT
     if heights is not None and heights.in_proportion:
         height = pictures.spread(heights.height) * height_maps.picture_side(config, unit) / size
         bound = BOUND_MARGIN * height if config.field.bound is None else bound
-    if config.source.refine != "none":
+    if config.source.refine != "none" and not smooth:
         source = refined(source, size / sigma, config.source.refine)
     frame, surface = normalised(source, device)
     areas = vertex_areas(surface)
@@ -129,6 +150,8 @@ def load(config: Config) -> Subject:
         source=source,
         style=style,
         heights=heights,
+        example=example,
+        smooth=smooth,
         frame=frame,
         surface=surface,
         areas=areas,
@@ -145,6 +168,7 @@ def load(config: Config) -> Subject:
             *too_coarse(source, size / sigma),
             *told,
             *mistaken(config, style, heights),
+            *(no_relief(config.style) if smooth else ()),
         ),
     )
 
@@ -324,6 +348,14 @@ def mistaken(config: Config, style: meshes.Mesh | np.ndarray, heights: Heights |
     return [
         f"'{name}' looks like a normal map: its colours are read as tone, not as directions; "
         "method=synthesis and method=displacement_map read it as one."
+    ]
+
+
+def no_relief(config: StyleConfig) -> list[str]:
+    """A note on a style that is a smooth ball, or a picture of one tone."""
+    return [
+        f"the style '{config.path or config.name}' has no relief to speak of, its surface or tone "
+        "is smooth: the source stays as it is"
     ]
 
 

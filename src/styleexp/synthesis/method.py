@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from styleexp import attributes, height_maps, meshes
+from styleexp import attributes, height_maps
 from styleexp.attributes import ATTRIBUTE
 from styleexp.errors import UserError
 from styleexp.fields import zero_mean
@@ -43,8 +43,6 @@ COARSEST = 0.06
 few parts of a mesh."""
 ROUNDS = (10, 6, 3)
 """Of the levels, from coarse to fine."""
-FLAT = 1e-4
-"""A relief lower than this, in units of the pattern, is none."""
 ROOM = 0.6
 """The relief may take up this share of the room inside and outside the surface."""
 
@@ -59,7 +57,7 @@ class Synthesis:
 
     def prepare(self, config: Config) -> Subject:
         """Source and style; neither renderer nor encoder."""
-        return load(config)
+        return load(config, lambda style: exemplar_of(style, config.style.relief_length))
 
     def start(self, scene: Subject) -> None:
         """There are no steps that a checkpoint could stand between."""
@@ -70,11 +68,13 @@ class Synthesis:
 
     def finish(self, scene: Subject, state: None) -> Result:
         """Displace the source by the relief; zero on average over the surface."""
+        if scene.smooth:
+            still = np.zeros(len(scene.source.vertices))
+            return Result(scene, still, scene.source.vertices.copy())
         rng = np.random.default_rng(scene.config.optim.seed)
-        doing("telling the style's relief from its shape")
+        doing("measuring the style's pattern")
         exemplar = exemplar_of_style(scene)
         pattern = measure(exemplar, rng)
-        _check(scene, pattern)
         surface = scene.surface
         sheet = Sheet(
             surface.vertices.cpu().numpy(), scene.source.faces, surface.normals.cpu().numpy()
@@ -117,8 +117,8 @@ def directions(scene: Subject, sheet: Sheet, directed: bool) -> Float[np.ndarray
 
 def exemplar_of_style(scene: Subject) -> MeshExemplar | PictureExemplar:
     """The style as an example; a picture's heights are ``scene.relief`` high."""
-    if isinstance(scene.style, meshes.Mesh):
-        return exemplar_of(scene.style)
+    if scene.example is not None:
+        return scene.example
     tile = height_maps.height_map(scene, height_maps.PATCH)
     pixel = tile.side / max(tile.height.shape) / scene.unit
     return PictureExemplar(tile.height.cpu() * (scene.relief / scene.unit), pixel)
@@ -150,13 +150,3 @@ def fade(sheet: Sheet, height: float) -> Float[np.ndarray, " vertices"]:
     room = np.minimum(ball_radius(sheet, -1, reach), ball_radius(sheet, 1, reach))
     factor = (ROOM * room / max(height, 1e-12)).clip(0, 1)
     return smoother(sheet.vertices, sheet.faces, 4 * height + sheet.edge)(factor).clip(0, 1)
-
-
-def _check(scene: Subject, pattern: Pattern) -> None:
-    if pattern.high - pattern.low > FLAT:
-        return
-    name = scene.config.style.path or scene.config.style.name
-    raise UserError(
-        f"the style '{name}' has no relief to speak of, its surface or tone is smooth: give one "
-        "with bumps or grooves, or a picture with contrast."
-    )
