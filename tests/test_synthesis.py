@@ -249,7 +249,6 @@ def test_strength_zero_gives_the_source_back_and_no_face_turns_over(striped):
 @pytest.mark.parametrize(
     ("style", "options", "told"),
     [
-        ("sphere", (), "has no relief to speak of"),
         ("bubble", ("style.direction=north",), "style.direction=north is not allowed"),
         ("bubble", ("baseline.bank=3",), "baseline.bank=3 is not allowed"),
     ],

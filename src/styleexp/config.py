@@ -353,6 +353,7 @@ BETWEEN = {
     "style.scale": (1e-3, 1e3),
     "style.image_tile": (1e-3, 1e3),
     "style.falloff": (0.0, 2.0),
+    "style.relief_length": (0.02, 4.0),
     "style.image_depth": (1e-4, 10.0),
     "field.features": (1, 65_536),
     "field.width": (1, 65_536),
@@ -442,7 +443,7 @@ def _check_placing(config: Config) -> None:
             "attribute:NAME."
         )
     if method in (None, "displacement_map", "geometric_textures"):
-        for key, plain in (("direction", "auto"), ("rotation", 0)):
+        for key, plain in (("direction", "auto"), ("rotation", 0), ("relief_length", None)):
             if (value := getattr(style, key)) != plain:
                 raise UserError(f"style.{key}={value} needs method=synthesis: no other reads it.")
     if method is None and (style.invert or style.kind not in ("auto", "photo")):

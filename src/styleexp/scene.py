@@ -58,8 +58,6 @@ MOST_REFINED = 200_000
 """Faces that refining aims at, at most."""
 SHORTER = 0.65
 """Mean edge over the longest after refining, which halves edges."""
-FLAT = 1e-4
-"""A picture whose heights spread less is of one tone."""
 STRAY = 5.0
 """A mesh has stray faces where a vertex is so many times farther off than 99 of 100 vertices."""
 
@@ -135,8 +133,6 @@ def load(
         smooth = example is None
         if example is not None and config.field.sigma is None:
             sigma = min(max(example.frequency, 1.0), 10.0)
-    elif relief_of is not None and heights is not None:
-        smooth = pictures.spread(heights.height) < FLAT
     if heights is not None and heights.in_proportion:
         height = pictures.spread(heights.height) * height_maps.picture_side(config, unit) / size
         bound = BOUND_MARGIN * height if config.field.bound is None else bound
@@ -177,6 +173,11 @@ def heights_of(config: Config, style: meshes.Mesh | np.ndarray) -> Heights | Non
     """A picture's heights; None for a mesh, of which the keys that say how to read pictures, where
     they are given, are refused."""
     if isinstance(style, np.ndarray):
+        if config.style.relief_length is not None:
+            raise UserError(
+                f"style.relief_length={config.style.relief_length} parts the shape of a style mesh "
+                "from its relief, and the style is a picture: leave it out."
+            )
         return pictures.picture_height(config, style)
     for key, plain in (("kind", "auto"), ("invert", False), ("image_depth", None)):
         if (value := getattr(config.style, key)) != plain:
@@ -352,10 +353,10 @@ def mistaken(config: Config, style: meshes.Mesh | np.ndarray, heights: Heights |
 
 
 def no_relief(config: StyleConfig) -> list[str]:
-    """A note on a style that is a smooth ball, or a picture of one tone."""
+    """A note on a style that is a smooth ball."""
     return [
-        f"the style '{config.path or config.name}' has no relief to speak of, its surface or tone "
-        "is smooth: the source stays as it is"
+        f"the style '{config.path or config.name}' has no relief to speak of, its surface is "
+        "smooth: the source stays as it is"
     ]
 
 

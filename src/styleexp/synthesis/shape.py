@@ -44,8 +44,8 @@ COARSE = 0.04
 """A style with longer edges on average, in radii, is refined, as patches are taken at vertices; of
 others edges two and a half times as long."""
 USUAL = (0.25, 2.0)
-"""The heights' mean square around a vertex, in shares of what a quarter of the surface exceeds, for
-it to be of the pattern: less is a flat base or a bare face, more a rim or an ear."""
+"""Mean square slope of the heights around a vertex, in shares of what a quarter of the surface
+exceeds, for it to be of the pattern: less is a flat base or a bare face, more a rim or an ear."""
 
 
 def exemplar_of(mesh: meshes.Mesh, length: float | None = None) -> MeshExemplar | None:
@@ -105,13 +105,22 @@ def _smoothed(mesh: meshes.Mesh, length: float) -> tuple[Sheet, Float[np.ndarray
 
 def _exemplar(sheet: Sheet, height: Float[np.ndarray, " vertices"], length: float) -> MeshExemplar:
     """With the parts where the heights are as usual told from those where they are not."""
-    around = smoother(sheet.vertices, sheet.faces, length)
-    energy = around((height - around(height)) ** 2) + around(height) ** 2
+    around = smoother(sheet.vertices, sheet.faces, length / 2)
+    energy = around(_steepness(sheet, height))
     order = energy.argsort()
     share = sheet.areas[order].cumsum()
     high = energy[order[np.searchsorted(share, 0.75 * share[-1])]]
     usual = (energy > USUAL[0] * high) & (energy < USUAL[1] * high)
     return MeshExemplar(sheet, height - np.average(height, weights=sheet.areas * usual), usual)
+
+
+def _steepness(
+    sheet: Sheet, height: Float[np.ndarray, " vertices"]
+) -> Float[np.ndarray, " vertices"]:
+    """Mean square slope of the faces round each vertex: by the normals of the surface itself."""
+    raised = sheet.vertices + height[:, None] * sheet.normals
+    normals = meshes.vertex_normals(raised, sheet.faces)
+    return ((normals - sheet.normals) ** 2).sum(axis=1)
 
 
 def _parts(mesh: meshes.Mesh) -> list[np.ndarray]:
