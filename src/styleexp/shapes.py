@@ -557,7 +557,7 @@ def _terrain(detail: int) -> tuple[np.ndarray, np.ndarray]:
 _MADE: dict[str, Callable[[int], tuple[np.ndarray, np.ndarray]]] = {
     "wool": _wool,
     "knit": lambda detail: _drum(detail, _stitches, 24),
-    "weave": lambda detail: _drum(detail, _bands, 24),
+    "weave": lambda detail: _drum(detail, _bands, 32),
     "lattice": cache(_lattice),
     "terrain": _terrain,
 }
