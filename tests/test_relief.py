@@ -12,7 +12,7 @@ def measure(mesh):
     return half_range(height), mesh_frequency(height, vertices, mesh.faces)
 
 
-@pytest.mark.parametrize("name", list(shapes.STYLES))
+@pytest.mark.parametrize("name", list(shapes.RELIEFS))
 def test_relief_of_the_analytic_styles_is_near_their_formula(name):
     mesh = shapes.make(name, detail=10_000)
     relief = shapes.relief(name, mesh.vertices / np.linalg.norm(mesh.vertices, axis=1)[:, None])

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from styleexp import shapes
+from styleexp import meshes, shapes
 from styleexp.errors import UserError
 from styleexp.meshes.remeshing import unfit
 
@@ -21,10 +21,15 @@ def shape(request):
 def test_names_are_the_registries():
     assert shapes.names() == [*shapes.STYLES, *shapes.SOURCES]
     assert all(shapes.STYLES.values())
-    assert set(shapes._RELIEFS) == set(shapes.STYLES)
+    assert set(shapes.STYLES) == {*shapes.RELIEFS, *shapes._MADE}
+    assert not set(shapes.RELIEFS) & set(shapes._MADE)
 
 
-def test_closed_manifold_one_component_and_outward(shape):
+HANDLES = {"torus": 1, "lattice": 31}
+BALLS = {"wool": 81}
+
+
+def test_manifold_outward_and_closed_with_the_right_handles(shape):
     faces, count = shape.faces, len(shape.vertices)
     assert shape.name in shapes.names()
     assert shape.vertices.dtype == np.float64
@@ -34,28 +39,34 @@ def test_closed_manifold_one_component_and_outward(shape):
     forward = edges[:, 0] * count + edges[:, 1]
     backward = edges[:, 1] * count + edges[:, 0]
     assert len(np.unique(forward)) == len(forward)  # each edge once a direction: coherent ...
-    np.testing.assert_array_equal(np.sort(forward), np.sort(backward))  # ... and closed
+    np.testing.assert_array_equal(np.unique(faces), np.arange(count))
     assert unfit(shape.vertices, faces) is None
+    if shape.name == "terrain":
+        assert len(np.setdiff1d(forward, backward)) == 4 * (np.sqrt(count) - 1)  # one border
+        assert (meshes.vertex_normals(shape.vertices, faces)[:, 1] > 0).all()
+        return
+    np.testing.assert_array_equal(np.sort(forward), np.sort(backward))  # ... and closed
     euler = count - len(edges) // 2 + len(faces)
-    assert euler == (0 if shape.name == "torus" else 2)  # 2 also says: one component
+    assert euler == 2 * BALLS.get(shape.name, 1) - 2 * HANDLES.get(shape.name, 0)
     a, b, c = (shape.vertices[faces[:, k]] for k in range(3))
     assert np.einsum("ij,ij->", a, np.cross(b, c)) > 0
-    np.testing.assert_array_equal(np.unique(faces), np.arange(count))
 
 
 def test_triangles_are_dense_and_even(shape):
     low, high = (35_000, 45_000) if shape.name in shapes.STYLES else (10_000, 40_000)
     assert low < len(shape.vertices) < high
     corners = shape.vertices[shape.faces]
-    if shape.name in shapes.STYLES:  # steep flanks stretch triangles: judge them on the sphere
+    if shape.name in shapes.RELIEFS:  # steep flanks stretch triangles: judge them on the sphere
         corners = corners / np.linalg.norm(corners, axis=2, keepdims=True)
     area = np.linalg.norm(
         np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
     )
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     quality = 2 * area / (np.sqrt(3) * longest**2)  # 1 for an equilateral triangle
-    assert np.median(quality) > 0.7
-    assert area.max() < 3 * area.mean()
+    assert np.median(quality) > (0.5 if shape.name == "terrain" else 0.7)  # halves of squares
+    # Steep walls again; and the ball inside the wool, which nobody sees, is as dense as a tuft.
+    uneven = shape.name in ("knit", "weave", "terrain", "wool")
+    assert area.max() < (15 if uneven else 3) * area.mean()
 
 
 def test_made_again_it_is_the_same_even_in_another_process(shape):
@@ -81,7 +92,7 @@ def test_a_changed_copy_does_not_change_the_next_one():
         np.testing.assert_array_equal(shapes.make(name, 2000).vertices, kept)
 
 
-@pytest.mark.parametrize("name", shapes.STYLES)
+@pytest.mark.parametrize("name", shapes.RELIEFS)
 def test_relief_is_the_height_of_the_mesh(name):
     mesh = shapes.make(name, detail=2_500)
     radius = np.linalg.norm(mesh.vertices, axis=1)
@@ -93,7 +104,7 @@ def test_relief_is_the_height_of_the_mesh(name):
     assert shapes.relief(name, np.zeros((0, 3))).shape == (0,)
 
 
-@pytest.mark.parametrize("name", shapes.STYLES)
+@pytest.mark.parametrize("name", shapes.RELIEFS)
 def test_relief_is_visible_and_moderate(name):
     directions, _ = shapes.icosphere(10_000)
     height = shapes.relief(name, directions)
@@ -101,7 +112,7 @@ def test_relief_is_visible_and_moderate(name):
     assert 0.025 < high - low < 0.14
     assert abs(np.median(height)) < 0.09
     # No style is a copy of another: their heights are uncorrelated.
-    for other in shapes.STYLES:
+    for other in shapes.RELIEFS:
         if other != name:
             assert abs(np.corrcoef(height, shapes.relief(other, directions))[0, 1]) < 0.5
 
@@ -133,5 +144,5 @@ def test_buckyball_has_twelve_pentagons_and_twenty_hexagons():
 def test_unknown_names_are_explained():
     with pytest.raises(UserError, match="did you mean 'stripe'"):
         shapes.make("stripes")
-    with pytest.raises(UserError, match="unknown style 'critter'"):
-        shapes.relief("critter", np.ones((1, 3)))
+    with pytest.raises(UserError, match="unknown style on a sphere 'wool'"):
+        shapes.relief("wool", np.ones((1, 3)))

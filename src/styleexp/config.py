@@ -69,6 +69,9 @@ class StyleConfig:
     falloff: float = 0.05
     """Width of the mask's borders, in radii of the normalised source; half of it lies on each
     side. 0 leaves the mask as it is."""
+    relief_length: float | None = None
+    """Mesh styles (``method=synthesis``): what is smaller than this, in radii of the style, is its
+    relief, the rest its shape; null finds it."""
     kind: str = "auto"
     """What a picture's colours are. ``photo``: its tone is height, as high as its pattern's size
     suggests. ``height``: height in proportion, see ``image_depth``. ``normal``: the directions of a
@@ -351,6 +354,7 @@ BETWEEN = {
     "style.scale": (1e-3, 1e3),
     "style.image_tile": (1e-3, 1e3),
     "style.falloff": (0.0, 2.0),
+    "style.relief_length": (0.02, 4.0),
     "style.image_depth": (1e-4, 10.0),
     "field.features": (1, 65_536),
     "field.width": (1, 65_536),
@@ -441,7 +445,7 @@ def _check_placing(config: Config) -> None:
         )
     learned = method is None and config.field.start != "synthesis"
     if learned or method in ("displacement_map", "geometric_textures"):
-        for key, plain in (("direction", "auto"), ("rotation", 0)):
+        for key, plain in (("direction", "auto"), ("rotation", 0), ("relief_length", None)):
             if (value := getattr(style, key)) != plain:
                 raise UserError(
                     f"style.{key}={value} needs method=synthesis or "

@@ -114,7 +114,7 @@ def mesh_patch(style: meshes.Mesh, radius: float) -> Float[np.ndarray, "side sid
 
     vertices = meshes.normalisation(style.vertices).apply(style.vertices)
     normals = meshes.vertex_normals(vertices, style.faces)
-    if style.carrier is None and style.name in shapes.STYLES:
+    if style.carrier is None and style.name in shapes.RELIEFS:
         height = shapes.relief(style.name, style.vertices)
     else:
         height = mesh_relief(vertices, style.faces, normals, RELIEF_LENGTH)

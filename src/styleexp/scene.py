@@ -29,6 +29,8 @@ from styleexp.viewer import Viewer
 from styleexp.views import orbit
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from jaxtyping import Float
     from torch import Tensor
 
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
     from styleexp.losses import Grams, StyleLoss
     from styleexp.renderers.base import Renderer
     from styleexp.styles import StyleTarget
+    from styleexp.synthesis.exemplar import MeshExemplar
 
 
 BOUND_MARGIN = 2.0
@@ -81,6 +84,10 @@ class Subject:
     """Half the range of the style's own relief, in such radii."""
     heights: Heights | None = None
     """Of a picture; None for a mesh."""
+    example: MeshExemplar | None = None
+    """Of a mesh, for the method that lays the relief by example."""
+    smooth: bool = False
+    """Whether that method found no relief on the style."""
     mask: Float[Tensor, " vertices"] | None = None
     """Factor on the displacement, 0 to 1 (``style.mask``); None is 1 everywhere."""
     notes: tuple[str, ...] = ()
@@ -105,8 +112,11 @@ class Scene(Subject):
     """What the distances of the global and the local views are divided by, for each layer."""
 
 
-def load(config: Config) -> Subject:
-    """Load source and style, and measure the style."""
+def load(
+    config: Config, relief_of: Callable[[meshes.Mesh], MeshExemplar | None] | None = None
+) -> Subject:
+    """Load source and style, and measure the style. ``relief_of`` tells a style mesh's relief from
+    its shape, None where there is none; the source is then refined for that relief."""
     check(config)
     device = choose_device(config.device)
     source = load_source(config.source)
@@ -117,10 +127,17 @@ def load(config: Config) -> Subject:
     unit = pattern_unit(config.style, source, style if isinstance(style, meshes.Mesh) else None)
     sigma, bound, height = choose_field(config.field, style, heights, config.style.image_tile)
     size = 1.0 if config.style.scale_by == "frame" else unit
+    example, smooth = None, False
+    if relief_of is not None and isinstance(style, meshes.Mesh):
+        doing("telling the style's relief from its shape")
+        example = relief_of(style)
+        smooth = example is None
+        if example is not None and config.field.sigma is None:
+            sigma = min(max(example.frequency, 1.0), 10.0)
     if heights is not None and heights.in_proportion:
         height = pictures.spread(heights.height) * height_maps.picture_side(config, unit) / size
         bound = BOUND_MARGIN * height if config.field.bound is None else bound
-    if config.source.refine != "none":
+    if config.source.refine != "none" and not smooth:
         source = refined(source, size / sigma, config.source.refine)
     frame, surface = normalised(source, device)
     areas = vertex_areas(surface)
@@ -130,6 +147,8 @@ def load(config: Config) -> Subject:
         source=source,
         style=style,
         heights=heights,
+        example=example,
+        smooth=smooth,
         frame=frame,
         surface=surface,
         areas=areas,
@@ -146,6 +165,7 @@ def load(config: Config) -> Subject:
             *too_coarse(source, size / sigma),
             *told,
             *mistaken(config, style, heights),
+            *(no_relief(config.style) if smooth else ()),
         ),
     )
 
@@ -154,6 +174,11 @@ def heights_of(config: Config, style: meshes.Mesh | np.ndarray) -> Heights | Non
     """A picture's heights; None for a mesh, of which the keys that say how to read pictures, where
     they are given, are refused."""
     if isinstance(style, np.ndarray):
+        if config.style.relief_length is not None:
+            raise UserError(
+                f"style.relief_length={config.style.relief_length} parts the shape of a style mesh "
+                "from its relief, and the style is a picture: leave it out."
+            )
         return pictures.picture_height(config, style)
     for key, plain in (("kind", "auto"), ("invert", False), ("image_depth", None)):
         if (value := getattr(config.style, key)) != plain:
@@ -177,7 +202,12 @@ def placed(
 
 def prepare(config: Config) -> Scene:
     """Load source, style, renderer and encoder, and measure the style."""
-    subject = load(config)
+    relief_of = None
+    if config.field.start == "synthesis":
+        from styleexp.synthesis import method
+
+        relief_of = method.relief_of(config)
+    subject = load(config, relief_of)
     doing("laying the style's height map on the source")
     base, told = start_of(subject)
     surface, style, unit = subject.surface, subject.style, subject.unit
@@ -238,7 +268,7 @@ def prepare(config: Config) -> Scene:
 
 def start_of(subject: Subject) -> tuple[Tensor | None, list[str]]:
     """What the field is added to (``field.start``), and what to tell the user about it."""
-    if subject.config.field.start == "source":
+    if subject.config.field.start == "source" or subject.smooth:
         return None, []
     if subject.config.field.start == "synthesis":
         from styleexp.synthesis.method import relief
@@ -329,6 +359,14 @@ def mistaken(config: Config, style: meshes.Mesh | np.ndarray, heights: Heights |
     return [
         f"'{name}' looks like a normal map: its colours are read as tone, not as directions; "
         "method=synthesis and method=displacement_map read it as one."
+    ]
+
+
+def no_relief(config: StyleConfig) -> list[str]:
+    """A note on a style that is a smooth ball."""
+    return [
+        f"the style '{config.path or config.name}' has no relief to speak of, its surface is "
+        "smooth: the source stays as it is"
     ]
 
 

@@ -1,9 +1,10 @@
 """Analytic shapes: styles with a known relief, and sources to put it on. Nothing to download.
 
-A style is the unit sphere displaced along its radius by a relief that is a formula of the
-direction: one can look at it, and also ask ``relief(name, points)`` for its true height anywhere.
-The styles are named after those of the paper (Sec. 4.2.1) and made from its words. Lengths are in
-units of the sphere's radius, +Y is up. Everything is deterministic.
+Most styles are the unit sphere displaced along its radius by a relief that is a formula of the
+direction: one can look at them, and also ask ``relief(name, points)`` for the true height anywhere.
+Those are named after the paper's (Sec. 4.2.1) and made from its words. The others show what else a
+style mesh can be: many components, a drum, a high genus, an open surface. Lengths are in units of
+the sphere's radius, +Y is up. Everything is deterministic.
 """
 
 from __future__ import annotations
@@ -29,6 +30,11 @@ STYLES: dict[str, str] = {
     "buckyball": "raised struts around sunk pentagons and hexagons",
     "scales": "overlapping rounded scales, like a fish's, pointing down",
     "cracks": "irregular plates parted by narrow grooves, like dried mud",
+    "wool": "curly tufts, each a ball of its own that overlaps the next ones",
+    "knit": "rows of knitted stitches, V below V, round a drum",
+    "weave": "flat bands that pass over and under each other, round a drum",
+    "lattice": "round struts along a football's seams, with holes between them",
+    "terrain": "hills and valleys on a square tile, an open surface",
 }
 SOURCES: dict[str, str] = {
     "sphere": "a smooth unit sphere",
@@ -43,12 +49,14 @@ def names() -> list[str]:
 
 
 def make(name: str, detail: int | None = None) -> Mesh:
-    """The shape of that name: closed, manifold, one component, outward, of even triangles.
+    """The shape of that name: manifold, outward, closed but for ``terrain``, of even triangles.
 
     ``detail`` is about how many vertices it gets; by default 40,000 for a style, so that the relief
     is crisp, and about 16,000 for a source. Raises `UserError` for an unknown name.
     """
-    if name in STYLES:
+    if name in _MADE:
+        points, faces = (array.copy() for array in _MADE[name](detail or 40_000))
+    elif name in RELIEFS:
         points, faces = icosphere(detail or 40_000)
         points = points * (1.0 + relief(name, points))[:, None]
     elif name == "sphere":
@@ -65,14 +73,14 @@ def make(name: str, detail: int | None = None) -> Mesh:
 def relief(name: str, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, " points"]:
     """Height of a style above the unit sphere in the directions of ``points``, in radii.
 
-    Raises `UserError` for a name that is not a style.
+    Raises `UserError` for a name that is not a style on the sphere.
     """
-    if name not in _RELIEFS:
-        raise unknown_name("style", name, STYLES)
+    if name not in RELIEFS:
+        raise unknown_name("style on a sphere", name, RELIEFS)
     points = np.asarray(points, dtype=np.float64)
     directions = points / np.linalg.norm(points, axis=1, keepdims=True)
     # In pieces, since most reliefs compare every point with every centre.
-    pieces = [_RELIEFS[name](directions[at : at + 4096]) for at in range(0, len(points), 4096)]
+    pieces = [RELIEFS[name](directions[at : at + 4096]) for at in range(0, len(points), 4096)]
     return np.concatenate(pieces) if pieces else np.zeros(0)
 
 
@@ -232,7 +240,7 @@ def _cracks(directions: np.ndarray) -> np.ndarray:
     return 0.055 * plate * (1.0 + level / 0.055) - 0.04
 
 
-_RELIEFS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+RELIEFS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "wave_small": lambda directions: _wave(directions, 7, 0.07),
     "wave_large": lambda directions: _wave(directions, 3, 0.16),
     "stripe": _stripe,
@@ -242,6 +250,7 @@ _RELIEFS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "scales": _scales,
     "cracks": _cracks,
 }
+"""Of the styles on the sphere: the height in each direction."""
 
 
 # ----------------------------------------------------------------------------------------- meshes
@@ -354,12 +363,6 @@ def _critter_distance(points: np.ndarray) -> np.ndarray:
     return _blend(body, head, 0.12)
 
 
-def _critter_gradient(points: np.ndarray, value: np.ndarray, step: float = 1e-4) -> np.ndarray:
-    return (
-        np.stack([_critter_distance(points + e) - value for e in step * np.eye(3)], axis=1) / step
-    )
-
-
 def _surface_net(
     distance: Callable[[np.ndarray], np.ndarray],
     low: tuple[float, ...],
@@ -402,10 +405,20 @@ def _surface_net(
 
 @cache
 def _critter(detail: int) -> tuple[np.ndarray, np.ndarray]:
+    return _implicit(_critter_distance, (-0.55, -0.85, -1.0), (0.55, 1.2, 1.1), 0.035, detail)
+
+
+def _implicit(
+    distance: Callable[[np.ndarray], np.ndarray],
+    low: tuple[float, ...],
+    high: tuple[float, ...],
+    step: float,
+    detail: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Zero surface of a signed distance: a coarse one, evened out, then pulled onto the exact."""
     import gpytoolbox
 
-    # A coarse iso-surface, evened out, then pulled onto the exact one.
-    points, faces = _surface_net(_critter_distance, (-0.55, -0.85, -1.0), (0.55, 1.2, 1.1), 0.035)
+    points, faces = _surface_net(distance, low, high, step)
     corners = points[faces]
     area = 0.5 * np.linalg.norm(
         np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
@@ -413,7 +426,138 @@ def _critter(detail: int) -> tuple[np.ndarray, np.ndarray]:
     length = float(np.sqrt(2.0 * area.sum() / (np.sqrt(3.0) * detail)))
     points, faces = gpytoolbox.remesh_botsch(points, faces.astype(np.int32), 5, length, True)
     for _ in range(4):
-        value = _critter_distance(points)
-        slope = _critter_gradient(points, value)
+        value = distance(points)
+        slope = np.stack([distance(points + e) - value for e in 1e-4 * np.eye(3)], axis=1) / 1e-4
         points = points - slope * (value / np.maximum((slope**2).sum(axis=1), 1e-6))[:, None]
     return points, faces.astype(np.int64)
+
+
+# ------------------------------------------------------------------------ styles beyond the sphere
+
+
+def _wool(detail: int) -> tuple[np.ndarray, np.ndarray]:
+    """Balls round a ball, each with a spiral ridge that starts at its outermost point."""
+    rng = np.random.default_rng(3)
+    count = 80
+    centers = _fibonacci(count) + 0.2 * _gap(count) * rng.normal(size=(count, 3))
+    centers *= (rng.uniform(0.74, 0.84, count) / np.linalg.norm(centers, axis=1))[:, None]
+    ball, faces = icosphere(int(detail / (count + 1)))
+    points = [0.75 * ball]
+    for center, size in zip(centers, rng.uniform(0.20, 0.26, count), strict=True):
+        out = center / np.linalg.norm(center)
+        right = np.cross(out, rng.normal(size=3))
+        right /= np.linalg.norm(right)
+        from_pole = np.arccos(np.clip(ball @ out, -1.0, 1.0))
+        turn = np.arctan2(ball @ np.cross(out, right), ball @ right)
+        ridge = np.cos(10.0 * from_pole - turn) * _smoothstep(2.5 * np.sin(from_pole))
+        points.append(center + size * (1.0 + 0.1 * ridge)[:, None] * ball)
+    shifted = [faces + k * len(ball) for k in range(count + 1)]
+    return np.concatenate(points), np.concatenate(shifted)
+
+
+def _drum(
+    detail: int, height: Callable[[np.ndarray, np.ndarray], np.ndarray], around: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """A round drum with ``height(across, up)`` on its wall, where ``around`` units go once round,
+    and on its ends; a rim between them is smooth."""
+    power, radius = 8.0, 0.8
+    points, faces = icosphere(detail)
+    side = np.hypot(points[:, 0], points[:, 2])
+    size = (side**power + np.abs(points[:, 1]) ** power) ** (1.0 / power)
+    points = radius * points / size[:, None]
+    side = np.hypot(points[:, 0], points[:, 2])
+    unit = 2.0 * np.pi * radius / around
+    wall = height(np.arctan2(points[:, 0], points[:, 2]) * radius / unit, points[:, 1] / unit)
+    end = height(points[:, 0] / unit, points[:, 2] / unit)
+    middle = np.median(wall)
+    inner = _smoothstep((0.9 * radius - np.abs(points[:, 1])) / (0.05 * radius))
+    top = _smoothstep((0.9 * radius - side) / (0.05 * radius))
+    total = unit * (inner * (wall - middle) + top * (end - middle))
+    slope = np.stack([points[:, 0] * side ** (power - 2), points[:, 1] ** (power - 1),
+                      points[:, 2] * side ** (power - 2)], axis=1)  # fmt: skip
+    return points + total[:, None] * slope / np.linalg.norm(slope, axis=1, keepdims=True), faces
+
+
+def _stitches(across: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Knitted stitches a unit wide, 0.75 high: two strands, leaning outward, in each."""
+    across = np.abs(across - np.round(across))
+    course = 0.75
+    total = np.zeros(len(across))
+    for row in (-1, 0, 1, 2):
+        # The strand goes from the stitch's foot up and out, a lens that dives under the next one.
+        x, y = across - 0.25, up - course * (np.floor(up / course) + row)
+        lean = np.array([0.28, 0.96])
+        along = (x * lean[0] + y * lean[1]) / 0.72
+        away = (x * lean[1] - y * lean[0]) / 0.245
+        total = np.maximum(total, 0.42 * np.sqrt(np.maximum(1.0 - away**2 - along**2, 0.0)))
+    return total
+
+
+def _bands(across: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Bands 0.86 wide, a unit apart, over and under each other."""
+    total = np.zeros(len(across))
+    for aside, along in ((across, up), (up, across)):
+        band = np.floor(aside)
+        away = np.abs(aside - band - 0.5) / 0.43
+        phase = 1.0 if aside is across else 0.0
+        level = 0.5 + 0.5 * np.sin(np.pi * (along + band + phase))
+        edge = np.sqrt(np.maximum(1.0 - away**4, 0.0))
+        total = np.maximum(total, np.where(away < 1.0, 0.17 * level + 0.11 * edge, 0.0))
+    return total
+
+
+def _lattice(detail: int) -> tuple[np.ndarray, np.ndarray]:
+    from scipy.spatial import cKDTree
+
+    points, faces = _icosahedron()
+    pairs = {tuple(sorted(pair)) for face in faces for pair in zip(face, np.roll(face, 1))}  # noqa: B905
+    a, b = points[np.array(sorted(pairs))].transpose(1, 0, 2)
+    corners = np.concatenate([(2.0 * a + b) / 3.0, (a + 2.0 * b) / 3.0])
+    corners /= np.linalg.norm(corners, axis=1, keepdims=True)
+    apart = np.linalg.norm(corners[:, None] - corners[None], axis=2)
+    ends = np.argwhere(np.triu(apart < 1.05 * apart[apart > 1e-6].min(), 1))
+    radius = 0.075
+
+    def distance(points: np.ndarray) -> np.ndarray:
+        total = np.full(len(points), 1.0)
+        around = cKDTree(points).query_ball_point(corners[ends].mean(axis=1), 0.4)
+        for near, (i, j) in zip(around, ends, strict=True):
+            strut = _limb(points[near], tuple(corners[i]), tuple(corners[j]), radius, radius)
+            total[near] = _blend(total[near], strut, 0.05)
+        return total
+
+    return _implicit(distance, (-1.203, -1.201, -1.207), (1.2, 1.2, 1.2), 0.03, detail)
+
+
+def _terrain(detail: int) -> tuple[np.ndarray, np.ndarray]:
+    """A tile of 2 by 2 with octaves of billowy noise, the longest the highest."""
+    side = round(np.sqrt(detail))
+    rng = np.random.default_rng(5)
+    across = np.linspace(-1.0, 1.0, side)
+    x, z = (axis.ravel() for axis in np.meshgrid(across, across, indexing="ij"))
+    height = np.zeros(side * side)
+    for frequency in 3.5 * 1.5 ** np.arange(7):
+        octave = np.zeros(side * side)
+        for turn in rng.uniform(0.0, 2.0 * np.pi, 12):
+            phase = np.pi * frequency * (np.cos(turn) * x + np.sin(turn) * z)
+            octave += np.cos(phase + rng.uniform(0.0, 2.0 * np.pi)) / np.sqrt(6.0)
+        height += frequency**-2.0 * np.sqrt(octave**2 + 0.05)  # valleys are sharper than hills
+    number = np.arange(side * side).reshape(side, side)
+    a, b, c, d = (
+        number[rows, columns].ravel()
+        for rows, columns in (
+            (slice(None, -1), slice(None, -1)), (slice(None, -1), slice(1, None)),
+            (slice(1, None), slice(1, None)), (slice(1, None), slice(None, -1)),
+        )
+    )  # fmt: skip
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    return np.stack([x, 0.055 * height / height.std(), z], axis=1), faces
+
+
+_MADE: dict[str, Callable[[int], tuple[np.ndarray, np.ndarray]]] = {
+    "wool": _wool,
+    "knit": lambda detail: _drum(detail, _stitches, 24),
+    "weave": lambda detail: _drum(detail, _bands, 32),
+    "lattice": cache(_lattice),
+    "terrain": _terrain,
+}

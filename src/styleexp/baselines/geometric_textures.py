@@ -327,7 +327,7 @@ def fit_exemplar(
     and subdivided, and its texture is where the mesh itself lies: no optimisation is needed.
     """
     frame = meshes.normalisation(style.vertices)
-    if style.carrier is None and style.name in shapes.STYLES:
+    if style.carrier is None and style.name in shapes.RELIEFS:
         radius = 1 / frame.scale
         points, faces = shapes.icosphere(base)
 

@@ -140,7 +140,7 @@ def _truth(options: argparse.Namespace) -> dict[str, Any]:
     def told(what: str) -> None:
         print(what, file=sys.stderr, flush=True)
 
-    styles, candidates = list(shapes.STYLES), truth.CANDIDATES
+    styles, candidates = list(shapes.RELIEFS), truth.CANDIDATES
     if options.pictures:
         styles, candidates = options.pictures.split(","), truth.PICTURE_CANDIDATES
         pictures = {}

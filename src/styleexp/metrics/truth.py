@@ -227,7 +227,7 @@ def measure_board(
         )
 
     board = Board()
-    styles = {name: shapes.make(name) for name in shapes.STYLES}
+    styles = {name: shapes.make(name) for name in shapes.RELIEFS}
     frequencies = {name: choose_field(FieldConfig(), style)[0] for name, style in styles.items()}
     for name, style in styles.items():
         vertices = meshes.normalisation(style.vertices).apply(style.vertices)

@@ -15,17 +15,20 @@ import torch
 from torch.nn import functional
 
 from styleexp.metrics.patches import blurred
-from styleexp.relief import smoother
+from styleexp.relief import mesh_frequency, smoother
 from styleexp.synthesis.direction import UP, direction_field, turned
 from styleexp.synthesis.walk import Sheet
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
     from torch import Tensor
 
 Y = (0.0, 1.0, 0.0)
+FLAT_UP = (0.0, 0.0, -1.0)
 LEAST_SEEN = 0.98
-"""Share of a patch that has to lie on the style mesh, not beyond its boundary."""
+"""Share of a patch that has to lie on the style mesh, not beyond its boundary, and where its relief
+is as usual; or the best `BEST` of all patches do."""
+BEST = 0.25
 UPRIGHT = 0.35
 """Sine of the angle between a style mesh's normal and its up below which no patch is taken there:
 round a pole of the direction field patterns turn."""
@@ -69,29 +72,50 @@ class MeshExemplar:
     sheet: Sheet
     """The smooth shape, in the unit sphere."""
     height: Float[np.ndarray, " vertices"]
+    usual: Bool[np.ndarray, " vertices"] | None = None
+    """Where the relief is the pattern; None is everywhere. Elsewhere are a rim, a flat base."""
     extent: float = 2.0
+
+    @cached_property
+    def up(self) -> tuple[float, float, float]:
+        """+Y; of a surface that lies flat, as a terrain does, -Z, as on a map."""
+        lying = np.linalg.norm(np.cross(self.sheet.normals, Y), axis=1) <= UPRIGHT
+        return FLAT_UP if np.average(lying, weights=self._weights) > 0.5 else Y
 
     @cached_property
     def ahead(self) -> Float[np.ndarray, "vertices 3"]:
         """Which way is up."""
-        return direction_field(self.sheet, np.broadcast_to(Y, self.sheet.vertices.shape), UP)
+        return direction_field(self.sheet, np.broadcast_to(self.up, self.sheet.vertices.shape), UP)
+
+    @property
+    def frequency(self) -> float:
+        """Root mean square frequency of the relief, in cycles per radius, where it is as usual."""
+        faces = self.sheet.faces
+        if self.usual is not None:
+            faces = faces[self.usual[faces].all(axis=1)]
+        return mesh_frequency(self.height, self.sheet.vertices, faces)
+
+    @cached_property
+    def _weights(self) -> Float[np.ndarray, " vertices"]:
+        """Vertices stand for the area around them: dense parts of a mesh don't count more."""
+        areas = self.sheet.areas
+        return areas if self.usual is None else areas * self.usual
 
     def sample(
         self, count: int, side: int, spacing: float, rng: np.random.Generator, any_way: bool
     ) -> tuple[Float[Tensor, "patches side side"], Places]:
         """See `Exemplar`. A place is a vertex and the unit tangent that is up there."""
         sheet = self.sheet
-        lying = np.linalg.norm(np.cross(sheet.normals, Y), axis=1)
-        allowed = np.flatnonzero((lying > UPRIGHT) | any_way)
-        # Vertices stand for the area around them: dense parts of a mesh don't count more.
-        share = sheet.areas[allowed]
+        standing = np.linalg.norm(np.cross(sheet.normals, self.up), axis=1)
+        allowed = np.flatnonzero((standing > UPRIGHT) | any_way)
+        share = self._weights[allowed]
         start = rng.choice(allowed, count, p=share / share.sum())
         ahead = self.ahead[start]
         if any_way:
             ahead = turned(ahead, sheet.normals[start], rng.uniform(0, 2 * np.pi, count))
         places = np.concatenate([start[:, None], ahead], axis=1)
         patches, seen = self._patches(places, side, spacing)
-        whole = seen >= LEAST_SEEN
+        whole = seen >= min(LEAST_SEEN, np.quantile(seen, 1 - BEST))
         return patches[torch.from_numpy(whole)], places[whole]
 
     def patches(
@@ -103,17 +127,19 @@ class MeshExemplar:
     def _patches(
         self, places: Places, side: int, spacing: float
     ) -> tuple[Float[Tensor, "patches side side"], Float[np.ndarray, " patches"]]:
-        """Patches, and how much of each lies on the mesh."""
+        """Patches, and how much of each lies on the mesh where its relief is as usual."""
         sheet = self.sheet
         start = places[:, 0].astype(np.int64)
         points, nears, _ = sheet.grids(start, places[:, 1:], side, spacing)
-        seen = sheet.on_the_mesh(points, nears).mean(axis=(1, 2))
+        seen = sheet.on_the_mesh(points, nears)
+        if self.usual is not None:
+            seen &= self.usual[nears]
         height = self.height
         if spacing > 1.5 * sheet.edge:
             height = smoother(sheet.vertices, sheet.faces, 2 * spacing)(height)
         sampling = sheet.interpolation(points.reshape(-1, 3), nears.ravel())
         sampled = sampling @ height.astype(np.float32)
-        return torch.from_numpy(sampled).float().view(-1, side, side), seen
+        return torch.from_numpy(sampled).float().view(-1, side, side), seen.mean(axis=(1, 2))
 
 
 @dataclass(frozen=True)

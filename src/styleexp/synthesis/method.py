@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
-from styleexp import attributes, height_maps, meshes
+from styleexp import attributes, height_maps
 from styleexp.attributes import ATTRIBUTE
 from styleexp.errors import UserError
 from styleexp.fields import zero_mean
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
+    from styleexp import meshes
     from styleexp.baselines.specs import SynthesisConfig
     from styleexp.config import Config
     from styleexp.scene import Subject
@@ -44,8 +45,6 @@ COARSEST = 0.06
 few parts of a mesh."""
 ROUNDS = (10, 6, 3)
 """Of the levels, from coarse to fine."""
-FLAT = 1e-4
-"""A relief lower than this, in units of the pattern, is none."""
 EVEN = 1.5
 """Edges: what is finer is taken off the relief, or steep walls between them would be saws."""
 ROOM = 0.6
@@ -64,7 +63,7 @@ class Synthesis:
 
     def prepare(self, config: Config) -> Subject:
         """Source and style; neither renderer nor encoder."""
-        return load(config)
+        return load(config, relief_of(config))
 
     def start(self, scene: Subject) -> None:
         """There are no steps that a checkpoint could stand between."""
@@ -75,6 +74,9 @@ class Synthesis:
 
     def finish(self, scene: Subject, state: None) -> Result:
         """Displace the source by the relief; zero on average over the surface."""
+        if scene.smooth:
+            still = np.zeros(len(scene.source.vertices))
+            return Result(scene, still, scene.source.vertices.copy())
         surface = scene.surface
         displacement = relief(scene, self.config, scene.config.strength)
         displacement = masked(displacement, scene.mask)
@@ -85,14 +87,18 @@ class Synthesis:
         return Result(scene, moved, scene.source.vertices + offset)
 
 
+def relief_of(config: Config) -> Callable[[meshes.Mesh], MeshExemplar | None]:
+    """What tells a style mesh's relief from its shape: see `scene.load`."""
+    return lambda style: exemplar_of(style, config.style.relief_length)
+
+
 def relief(scene: Subject, config: SynthesisConfig, strength: float) -> Float[Tensor, " vertices"]:
     """The style's relief on the source's vertices, ``strength`` times as high, in radii of the
     normalised source; zero on average over the surface."""
     rng = np.random.default_rng(scene.config.optim.seed)
-    doing("telling the style's relief from its shape")
+    doing("measuring the style's pattern")
     exemplar = exemplar_of_style(scene)
     pattern = measure(exemplar, rng)
-    _check(scene, pattern)
     surface = scene.surface
     sheet = Sheet(surface.vertices.cpu().numpy(), scene.source.faces, surface.normals.cpu().numpy())
     directed = pattern.directed > DIRECTED
@@ -136,8 +142,8 @@ def directions(scene: Subject, sheet: Sheet, directed: bool) -> Float[np.ndarray
 
 def exemplar_of_style(scene: Subject) -> MeshExemplar | PictureExemplar:
     """The style as an example; a picture's heights are ``scene.relief`` high."""
-    if isinstance(scene.style, meshes.Mesh):
-        return exemplar_of(scene.style)
+    if scene.example is not None:
+        return scene.example
     tile = height_maps.height_map(scene, height_maps.PATCH)
     pixel = tile.side / max(tile.height.shape) / scene.unit
     return PictureExemplar(tile.height.cpu() * (scene.relief / scene.unit), pixel)
@@ -169,13 +175,3 @@ def fade(sheet: Sheet, height: float) -> Float[np.ndarray, " vertices"]:
     room = np.minimum(ball_radius(sheet, -1, reach), ball_radius(sheet, 1, reach))
     factor = (ROOM * room / max(height, 1e-12)).clip(0, 1)
     return smoother(sheet.vertices, sheet.faces, 4 * height + sheet.edge)(factor).clip(0, 1)
-
-
-def _check(scene: Subject, pattern: Pattern) -> None:
-    if pattern.high - pattern.low > FLAT:
-        return
-    name = scene.config.style.path or scene.config.style.name
-    raise UserError(
-        f"the style '{name}' has no relief to speak of, its surface or tone is smooth: give one "
-        "with bumps or grooves, or a picture with contrast."
-    )
