@@ -143,6 +143,8 @@ def test_experiment_runs(path, tmp_path):
         arguments += ["source.refine=none", "baseline.bank=500"]
     elif path.stem in BY_SYNTHESIS:
         arguments.append("method=robust")
+    elif "synthesis" in params.get("method", ""):
+        arguments.append("source.refine=none")
     for overrides in experiment_jobs([f"+experiment={path.stem}", *arguments]):
         chosen = compose([*overrides, "hydra.mode=RUN"])
         for name in (chosen.source.name, chosen.style.name):

@@ -41,6 +41,8 @@ the best patch of all. The first at the first level, where seams are mended: the
 with all its seams."""
 AT_ONCE = 256
 """Grids that are compared with the whole bank at once: the distances then fit a cache."""
+CHOICE = 0.3
+"""Pieces that the quilt chooses from, for each patch of a bank."""
 SIMILAR = 12
 """Patches like the last best one that a grid is compared with where the whole bank is too slow."""
 TRUST = 0.6
@@ -146,7 +148,8 @@ def synthesise(
     """
     doing("covering the source with pieces of the style")
     first, last = levels[0], levels[-1]
-    laid = quilt(sheet, ahead, exemplar, first.spacing, last.spacing, unit, any_way, rng)
+    choice = round(CHOICE * most)
+    laid = quilt(sheet, ahead, exemplar, first.spacing, last.spacing, unit, any_way, rng, choice)
     height = laid.heights()
     done = 0
     for level in levels:

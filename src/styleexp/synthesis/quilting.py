@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 SIDE = 25
 """Samples on a piece's side."""
-CHOICE = 3000
-"""Pieces of the exemplar that are tried at each place."""
 APART = 0.45
 """Distance of pieces on the mesh, in their sides; less where a first round left gaps."""
 SAME_WAY = 0.2
@@ -77,15 +75,16 @@ def quilt(
     unit: float,
     any_way: bool,
     rng: np.random.Generator,
+    choice: int,
 ) -> Quilt:
     """Cover the mesh by pieces of the exemplar, each the one that agrees best with what lies there
     already (after Efros and Freeman 2001; Praun et al. 2000).
 
     What is larger than a patch of the synthesis, as a brick or how rows are offset, the synthesis
     can only keep, not find. ``spacing`` is that of the samples by which pieces are compared, and
-    ``finest`` of those that are kept.
+    ``finest`` of those that are kept. ``choice`` pieces are tried at each place.
     """
-    known, places = exemplar.sample(CHOICE, SIDE, spacing, rng, any_way)
+    known, places = exemplar.sample(choice, SIDE, spacing, rng, any_way)
     pieces = known.flatten(1).numpy()
     squares = pieces**2
     step = spacing * unit
