@@ -105,7 +105,8 @@ def _smoothed(mesh: meshes.Mesh, length: float) -> tuple[Sheet, Float[np.ndarray
 
 def _exemplar(sheet: Sheet, height: Float[np.ndarray, " vertices"], length: float) -> MeshExemplar:
     """With the parts where the heights are as usual told from those where they are not."""
-    around = smoother(sheet.vertices, sheet.faces, length / 2)
+    # As wide as a panel between struts, which is of the pattern.
+    around = smoother(sheet.vertices, sheet.faces, 0.7 * length)
     energy = around(_steepness(sheet, height))
     order = energy.argsort()
     share = sheet.areas[order].cumsum()
