@@ -328,10 +328,19 @@ def refined(mesh: meshes.Mesh, wavelength: float, how: str) -> meshes.Mesh:
     area = meshes.face_areas(mesh.vertices, mesh.faces).sum()
     faces = MOST_REFINED if how == "auto" else float(how)
     longest = math.sqrt(area / (faces * math.sqrt(3) / 4)) / SHORTER
-    if how == "auto":
-        longest = max(wavelength / PER_WAVE * scale, longest)
     doing("refining the source for the style")
-    return meshes.refine(mesh, longest)
+    if how == "auto":
+        return meshes.refine(mesh, max(wavelength / PER_WAVE * scale, longest))
+    # An even mesh has all its edges halved at once, or only some, by a hair of the length.
+    low, high = longest / 2, longest * 2
+    fine = mesh
+    for _ in range(8):
+        longest = math.sqrt(low * high)
+        fine = meshes.refine(mesh, longest)
+        if abs(math.log(len(fine.faces) / faces)) < 0.1:
+            break
+        low, high = (longest, high) if len(fine.faces) > faces else (low, longest)
+    return fine
 
 
 def too_coarse(mesh: meshes.Mesh, wavelength: float) -> list[str]:
