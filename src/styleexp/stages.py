@@ -31,6 +31,12 @@ def doing(what: str, at_once: bool = False) -> None:
         print(f"{what} ...", flush=True)
 
 
+def tell(what: str) -> None:
+    """Say what was found, where somebody listens: a Python caller's terminal is its own."""
+    if _listening:
+        print(what, flush=True)
+
+
 @contextmanager
 def announced() -> Iterator[None]:
     """Have the stages of this process printed that take long."""

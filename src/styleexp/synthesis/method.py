@@ -17,7 +17,7 @@ from styleexp.geometry import unfolded
 from styleexp.masks import masked
 from styleexp.relief import half_range, mesh_relief, smoother
 from styleexp.scene import load
-from styleexp.stages import doing
+from styleexp.stages import doing, tell
 from styleexp.stylize import Result, Step
 from styleexp.synthesis.direction import FLOW, UP, direction_field, turned
 from styleexp.synthesis.exemplar import MeshExemplar, Pattern, PictureExemplar, measure
@@ -104,7 +104,7 @@ def relief(scene: Subject, config: SynthesisConfig, strength: float) -> Float[Te
     directed = pattern.directed > DIRECTED
     ahead = directions(scene, sheet, directed)
     levels = levels_of(pattern, sheet.edge / scene.unit)
-    print(told(scene, pattern, directed, levels), flush=True)
+    tell(told(scene, pattern, directed, levels))
 
     height = torch.zeros(len(sheet.vertices))
     total = sum(level.rounds for level in levels)
