@@ -105,13 +105,13 @@ def test_homography_maps_the_corners():
 
 
 def test_random_perspective_fills_and_keeps_what_it_does_not_draw():
-    config = ViewsConfig(perspective=0.5, perspective_probability=1.0, perspective_fill=1.0)
+    config = ViewsConfig(perspective=0.5, perspective_probability=1.0)
     black = torch.zeros(4, 40, 40, 1)
-    warped = views.random_perspective(config, black, rng())
+    warped = views.random_perspective(config, black, 1.0, rng())
     assert warped[:, 0, 0].max() > 0.5  # corners were drawn inwards: white came in
     assert warped[:, 20, 20].max() < 1e-4
     config.perspective_probability = 0.0
     torch.testing.assert_close(
-        views.random_perspective(config, torch.rand(2, 8, 8, 1, generator=rng()), rng()),
+        views.random_perspective(config, torch.rand(2, 8, 8, 1, generator=rng()), 1.0, rng()),
         torch.rand(2, 8, 8, 1, generator=rng()),
     )

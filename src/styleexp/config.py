@@ -111,6 +111,12 @@ class FieldConfig:
     width: int = 256
     depth: int = 8
     """Fully connected layers, the output layer included."""
+    last_layer: str = "zero"
+    """How the output layer's weights begin. ``zero``: d is 0 at the first step. ``random``: like
+    the other layers', so that d is small noise."""
+    limit: str = "tanh"
+    """What keeps displacements within the bound: ``tanh``, or ``clamp``, which has no gradient at
+    the bound."""
     bound: float | None = None
     """Displacements lie in (-bound, bound), in radii; see ``style.scale_by``. null: twice what the
     style mesh's own relief needs; of a picture, which doesn't tell its height, twice 0.15 of its
@@ -143,6 +149,9 @@ class LocalViewsConfig:
     """That share."""
     size: int = 112
     """Pixels on a side; ``image`` crops are resized to it."""
+    perspective: str = "after"
+    """``image``: whether the random perspective is drawn ``after`` the crop, for each crop anew, or
+    ``before`` it, for the view that is cropped."""
     extent: float = 0.5
     """``surface``: width of the window at the surface, in radii of the normalised mesh."""
 
@@ -168,7 +177,8 @@ class ViewsConfig:
     perspective: float = 0.0
     """Distortion of the random perspective (omega_global); 0 is off."""
     perspective_probability: float = 0.8
-    perspective_fill: float = 1.0
+    perspective_fill: float | None = None
+    """Grey of what a perspective brings in from outside the frame; null: the background's."""
     local: LocalViewsConfig = option(default_factory=LocalViewsConfig)
 
 
@@ -184,6 +194,8 @@ class ShadingConfig:
     outlines: bool = False
     """Whether outlines carry gradients, where the renderer can. Off in the paper; where they do,
     the optimiser grows knobs to make outlines inside the frame."""
+    light_frame: str = "camera"
+    """Where the light stands still: ``camera``, as in Text2Mesh, or ``world``."""
     lights: int = 3
     """1: a grey picture under one light, as in the paper. 3: besides, the same light turned by 120
     and 240 degrees about the viewing axis, each in a colour of its own: the colour then tells the
@@ -202,6 +214,8 @@ class EncoderConfig:
     """``auto`` (bf16 where the hardware gains from it), ``fp32`` or ``bf16``; the one chosen is in
     the run's record."""
     pooling: str = "max"
+    activations: str = "relu"
+    """What a layer serves: its output after the ReLU, or before it (``conv``)."""
     normalisation: str = "weights"
     """``weights``: what the weights were trained with; ``paper``: the constants of Sec. 4.1."""
 
@@ -217,6 +231,11 @@ class LossConfig:
     """Style layers, by name or by the paper's 1-based index of VGG-19's convolutions."""
     block_weights: list[float] = option(default_factory=lambda: [0.3, 0.5, 1.0, 2.0, 2.0])
     """A weight for the layers of each of VGG's five blocks."""
+    normalisation: str = "channels_cells"
+    """What a layer's F^T F is divided by. ``none``, as Eqs. 3 to 6 are written; ``cells``: by how
+    many cells it sums over; ``channels_cells``: besides by the channels; ``mean``: as before, and
+    the squared distance is the mean over the matrix, not its sum. With Adam, only the layers'
+    weights against each other differ."""
     lambda_global: float = 0.3
     lambda_local: float = 1.0
     """lambda of Eq. 7 (paper: 0.1)."""
@@ -230,7 +249,8 @@ class LossConfig:
     starts at about 1."""
     target: str = "bank"
     """``bank``: the style's Grams are averaged once over a bank of views. ``same_views``: the style
-    mesh is rendered at the result's views in every step, as in the paper. ``whole``: the same, but
+    mesh is rendered at the result's views in every step, as in the paper; ``own_views``: at random
+    views of its own. ``whole``: the same as ``same_views``, but
     a picture is the target of local views as a whole, too, not in crops, as in Text2Mesh."""
     bank_views: int = 24
     relief_weight: float = 1.0
@@ -328,6 +348,12 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "field.start": ("map", "source", "synthesis"),
     "views.local.mode": ("image", "zoom", "surface"),
     "views.local.crop": ("side", "area"),
+    "views.local.perspective": ("after", "before"),
+    "field.last_layer": ("zero", "random"),
+    "field.limit": ("tanh", "clamp"),
+    "shading.light_frame": ("camera", "world"),
+    "encoder.activations": ("relu", "conv"),
+    "loss.normalisation": ("none", "cells", "channels_cells", "mean"),
     "shading.normals": ("flat", "smooth"),
     "shading.lights": (1, 3),
     "encoder.precision": ("auto", "fp32", "bf16"),
@@ -335,7 +361,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "encoder.normalisation": ("weights", "paper"),
     "optim.schedule": ("step", "cosine"),
     "loss.relative": ("none", "target", "source"),
-    "loss.target": ("bank", "same_views", "whole"),
+    "loss.target": ("bank", "same_views", "own_views", "whole"),
     "preview.name": ("builtin", "pyrender"),
     "preview.platform": ("auto", "egl", "osmesa"),
 }

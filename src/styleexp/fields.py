@@ -62,12 +62,13 @@ class FourierFeatures(nn.Module):
 class DisplacementField(nn.Module):
     """MLP from a position to its displacement along the normal, in (-bound, bound).
 
-    The last layer starts at zero, so that the generated mesh is the source mesh at step 0.
-    ``sigma`` is in cycles per radius of the normalised source, ``bound`` in such radii.
+    The last layer starts at zero, so that the generated mesh is the source mesh at step 0, unless
+    ``last_layer`` is ``random``. ``sigma`` is in cycles per radius of the normalised source,
+    ``bound`` in such radii.
 
-    With ``zero_mean`` the mean over the vertices is taken off before tanh, too: no loss holds it,
-    since the mean displacement is taken off as well, and where it drifts, tanh saturates everywhere
-    and nothing is learned any more.
+    With ``zero_mean`` the mean over the vertices is taken off before the ``limit``, too: no loss
+    holds it, since the mean displacement is taken off as well, and where it drifts, the limit holds
+    every vertex and nothing is learned any more.
     """
 
     def __init__(self, config: FieldConfig, generator: torch.Generator, sigma: float, bound: float):
@@ -81,8 +82,10 @@ class DisplacementField(nn.Module):
             span = 1 / math.sqrt(layer.in_features)
             nn.init.uniform_(layer.weight, -span, span, generator=generator)
             nn.init.uniform_(layer.bias, -span, span, generator=generator)
-        nn.init.zeros_(linears[-1].weight)
-        nn.init.zeros_(linears[-1].bias)
+        if config.last_layer == "zero":
+            nn.init.zeros_(linears[-1].weight)
+            nn.init.zeros_(linears[-1].bias)
+        self.limit = config.limit
         self.hidden = nn.ModuleList(linears[:-1])
         self.last = linears[-1]
 
@@ -106,7 +109,8 @@ class DisplacementField(nn.Module):
             else:
                 x = torch.relu(nn.functional.linear(x, weight, bias))
         latent = self.last(x.float()).squeeze(-1)
-        return self.bound * torch.tanh(latent - latent.mean() if self.centred else latent)
+        latent = latent - latent.mean() if self.centred else latent
+        return self.bound * (torch.tanh(latent) if self.limit == "tanh" else latent.clamp(-1, 1))
 
 
 class _LinearRelu(torch.autograd.Function):

@@ -28,25 +28,32 @@ Grams = list["Float[Tensor, 'channels channels']"]
 def gram_matrix(
     features: Float[Tensor, "views channels height width"],
     mask: Bool[Tensor, "views height width"] | None = None,
+    normalisation: str = "channels_cells",
 ) -> Float[Tensor, "channels channels"]:
-    """G = F^T F of all views together, divided by channels x cells.
+    """G = F^T F of all views together, divided as ``LossConfig.normalisation`` says.
 
     The paper's Eqs. 3-6 sum over views and add matrices of different layers; read here as one Gram
     per layer, averaged over views. With a mask, only its cells are summed and counted, so the share
     of the frame that the object fills doesn't matter. An empty mask gives zeros.
     """
     cells = features[:, 0].numel()
-    return mean_gram(_Gram.apply(features, mask), mask, cells)
+    return mean_gram(_Gram.apply(features, mask), mask, cells, normalisation)
 
 
 def mean_gram(
     total: Float[Tensor, "channels channels"],
     mask: Bool[Tensor, "views height width"] | None,
     cells: int,
+    normalisation: str = "channels_cells",
 ) -> Float[Tensor, "channels channels"]:
-    """A sum of F^T F over the masked ones of so many cells, divided by channels x cells."""
+    """A sum of F^T F over the masked ones of so many cells, divided as
+    ``LossConfig.normalisation`` says."""
+    if normalisation == "none":
+        return total
     count = cells if mask is None else mask.sum().clamp(min=1)
-    return total / (len(total) * count)
+    # A sum of C x C squares becomes their mean where what is squared is divided by C.
+    channels = {"cells": 1, "channels_cells": len(total), "mean": len(total) ** 2}[normalisation]
+    return total / (channels * count)
 
 
 class _Gram(torch.autograd.Function):
@@ -127,13 +134,19 @@ class StyleLoss:
             by_name = dict(zip(self.layers, self._masks(seen, cells), strict=True))
             sums = self.encoder.gram_sums(images, by_name)
             return [
-                mean_gram(sums[name], by_name[name], len(images) * math.prod(shape))
+                mean_gram(
+                    sums[name],
+                    by_name[name],
+                    len(images) * math.prod(shape),
+                    self.config.normalisation,
+                )
                 for name, shape in zip(self.layers, cells, strict=True)
             ]
         features = self.encoder(images, self.layers)
         found = [features[name] for name in self.layers]
         masks = self._masks(seen, [(each.shape[2], each.shape[3]) for each in found])
-        return [gram_matrix(each, mask) for each, mask in zip(found, masks, strict=True)]
+        how = self.config.normalisation
+        return [gram_matrix(each, mask, how) for each, mask in zip(found, masks, strict=True)]
 
     def _masks(
         self, seen: Images, cells: Sequence[tuple[int, int]]

@@ -236,7 +236,8 @@ def prepare(config: Config) -> Scene:
         _, styled = normalised(style, device)
         if config.loss.target != "bank":
             style_viewer = Viewer(config, renderer, shading, styled, unit, lights)
-            target = styles.SameViewsTarget(loss, style_viewer, styled.vertices)
+            later = styles.OWN_VIEWS if config.loss.target == "own_views" else 0
+            target = styles.RenderedTarget(loss, style_viewer, styled.vertices, later)
         else:
             target = measured(styled, unit)
     else:

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 BANK_STEP = 1_000_000
 """Steps from here on number the style bank's draws, so that no training step draws the same."""
+OWN_VIEWS = 2_000_000
+"""The same for the style's views with ``loss.target=own_views``."""
 
 
 class StyleTarget(Protocol):
@@ -44,16 +46,19 @@ class FixedTarget:
         return self.grams
 
 
-class SameViewsTarget:
-    """The style mesh rendered at the generated mesh's own views, as in the paper."""
+class RenderedTarget:
+    """The style mesh rendered anew in every step: at the generated mesh's own views, as in the
+    paper, or ``later`` steps' ones, so that the two see different views."""
 
-    def __init__(self, loss: StyleLoss, viewer: Viewer, vertices: Float[Tensor, "vertices 3"]):
-        self.loss, self.viewer, self.vertices = loss, viewer, vertices
+    def __init__(
+        self, loss: StyleLoss, viewer: Viewer, vertices: Float[Tensor, "vertices 3"], later: int = 0
+    ):
+        self.loss, self.viewer, self.vertices, self.later = loss, viewer, vertices, later
 
     @torch.no_grad()
     def __call__(self, step: int) -> tuple[Grams, Grams]:
         """Grams of the style mesh at this step's views."""
-        whole, local = self.viewer(self.vertices, step)
+        whole, local = self.viewer(self.vertices, step + self.later)
         return self.loss.grams(whole), self.loss.grams(local)
 
 

@@ -48,6 +48,7 @@ class Viewer:
     ):
         self.config = config.views
         self.light_spread = config.shading.light_spread
+        self.light_frame = config.shading.light_frame
         self.seed = config.optim.seed
         self.renderer = renderer
         self.shading = shading
@@ -72,7 +73,9 @@ class Viewer:
         cameras = views.zoom(cameras, self.scale)
         size = self.config.resolution
         whole = self._render(vertices, cameras, size, generator)
-        return self._perspective(whole, generator), self._local(vertices, cameras, whole, generator)
+        warped = self._perspective(whole, generator)
+        cut_from = warped if self.config.local.perspective == "before" else whole
+        return warped, self._local(vertices, cameras, cut_from, generator)
 
     def _local(
         self,
@@ -94,7 +97,8 @@ class Viewer:
         cut = views.crop_images(
             torch.cat([whole.image, whole.coverage[..., None]], dim=-1), windows, view, local.size
         )
-        return self._perspective(Images(cut[..., :-1], cut[..., -1]), generator)
+        seen = Images(cut[..., :-1], cut[..., -1])
+        return seen if local.perspective == "before" else self._perspective(seen, generator)
 
     def _render(
         self,
@@ -109,6 +113,8 @@ class Viewer:
         lights = torch.stack(
             [turned_light(self.shading, turn + 360 * i / self.lights) for i in range(self.lights)]
         )
+        if self.light_frame == "world":
+            lights = torch.einsum("vij,lvj->lvi", cameras.rotation, lights.to(cameras.rotation))
         out = self.renderer.render_lights(
             vertices, self.faces, cameras, self.shading, lights, (size, size)
         )
@@ -117,13 +123,12 @@ class Viewer:
     def _perspective(self, seen: Images, generator: torch.Generator) -> Images:
         if self.config.perspective == 0:
             return seen
-        both = torch.cat(
-            # The fill is an image's; shifted by it, coverage comes out as 0 beyond the frame.
-            [seen.image, seen.coverage[..., None] + self.config.perspective_fill],
-            dim=-1,
-        )
-        both = views.random_perspective(self.config, both, generator)
-        return Images(both[..., :-1], both[..., -1] - self.config.perspective_fill)
+        fill = self.config.perspective_fill
+        fill = self.shading.background if fill is None else fill
+        # The fill is an image's; shifted by it, coverage comes out as 0 beyond the frame.
+        both = torch.cat([seen.image, seen.coverage[..., None] + fill], dim=-1)
+        both = views.random_perspective(self.config, both, fill, generator)
+        return Images(both[..., :-1], both[..., -1] - fill)
 
 
 def turned_light(shading: Shading, degrees: Float[Tensor, " views"]) -> Float[Tensor, "views 3"]:

@@ -141,10 +141,11 @@ def crop_images(
 def random_perspective(
     config: ViewsConfig,
     images: Float[Tensor, "n height width channels"],
+    fill: float,
     generator: torch.Generator,
 ) -> Float[Tensor, "n height width channels"]:
     """omega_global: every corner is drawn inwards by up to ``perspective`` half-frames, with the
-    configured probability; what comes in from outside is ``perspective_fill``."""
+    configured probability; what comes in from outside is ``fill``."""
     if config.perspective == 0:
         return images
     count = len(images)
@@ -166,7 +167,6 @@ def random_perspective(
     )
     mapped = torch.einsum("nij,hwj->nhwi", to_input, grid)
     mapped = mapped[..., :2] / mapped[..., 2:].clamp(min=1e-6)
-    fill = config.perspective_fill
     warped = functional.grid_sample(images.permute(0, 3, 1, 2) - fill, mapped, align_corners=False)
     return warped.permute(0, 2, 3, 1) + fill
 

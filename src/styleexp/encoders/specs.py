@@ -30,6 +30,7 @@ def _pretrained(config: EncoderConfig, *, device: str | torch.device, seed: int)
         weights.read(assets.find(config.name, "weights")),
         precision=config.precision,
         pooling=config.pooling,
+        activations=config.activations,
         normalisation=config.normalisation,
         device=device,
     )
@@ -48,6 +49,7 @@ def _random(config: EncoderConfig, *, device: str | torch.device, seed: int) -> 
         vgg.random_weights(vgg.VGG19_CONVS, seed),
         precision=config.precision,
         pooling=config.pooling,
+        activations=config.activations,
         normalisation=config.normalisation,
         device=device,
     )

@@ -41,7 +41,8 @@ class Encoder(nn.Module):
     """VGG activations by layer name.
 
     The network is 3x3 convolutions with zero padding 1, ReLU, and 2x2 pooling between blocks. The
-    served activations are those *after* the ReLU, in the compute dtype (``precision``). Weights are
+    served activations are those *after* the ReLU, unless ``activations`` is ``conv``, in the
+    compute dtype (``precision``). Weights are
     frozen; gradients flow to the images.
     """
 
@@ -54,6 +55,7 @@ class Encoder(nn.Module):
         weights: VGGWeights,
         *,
         pooling: str = "max",
+        activations: str = "relu",
         mean: Sequence[float] | None = None,
         std: Sequence[float] | None = None,
     ) -> None:
@@ -63,12 +65,14 @@ class Encoder(nn.Module):
             name: for messages and records.
             weights: convolutions ``convB_I`` in torchvision's convention.
             pooling: ``max`` or ``avg``.
+            activations: ``relu``, or ``conv`` for those before the ReLU.
             mean: input normalisation, RGB; that of the weights unless given.
             std: likewise.
         """
         super().__init__()
         self.name = name
         self.pooling = pooling
+        self.activations = activations
         self.layer_names = tuple(
             sorted({key.partition(".")[0] for key in weights.tensors}, key=_position)
         )
@@ -149,8 +153,8 @@ class Encoder(nn.Module):
             layers: names or the paper's indices.
 
         Returns:
-            Name -> post-ReLU activations in the compute dtype, in the order of ``layers``; rows
-            are ``height // stride``. Do not write into them: the backward pass needs them.
+            Name -> activations (see the class) in the compute dtype, in the order of ``layers``;
+            rows are ``height // stride``. Do not write into them: the backward pass needs them.
 
         Raises:
             UserError: an unknown layer, or images too small for the deepest layer.
@@ -163,17 +167,22 @@ class Encoder(nn.Module):
             if _position(layer)[0] != _position(before)[0]:
                 pool = functional.max_pool2d if self.pooling == "max" else functional.avg_pool2d
                 x = pool(x, 2)
-            # In place on the convolution's own output, which nothing else needs; what comes next
-            # makes a new tensor, so served activations stay as they are.
-            x = self.convs[layer](x).relu_()
-            served[layer] = x
+            x = self.convs[layer](x)
+            if self.activations == "conv":
+                served[layer], x = x, x.relu()
+            else:
+                # In place on the convolution's own output, which nothing else needs; what comes
+                # next makes a new tensor, so served activations stay as they are.
+                served[layer] = x = x.relu_()
         return {name: served[name] for name in names}
 
     @property
     def is_fused(self) -> bool:
-        """Whether `gram_sums` can be used: on a CPU with oneDNN, in fp32 or bf16."""
+        """Whether `gram_sums` can be used: on a CPU with oneDNN, after the ReLU, in fp32 or
+        bf16."""
         weight = next(self.convs.parameters())
         has = weight.device.type == "cpu" and torch.backends.mkldnn.is_available()
+        has = has and self.activations == "relu"
         return has and weight.dtype in fused.BITS
 
     def gram_sums(
@@ -244,6 +253,7 @@ def build(
     *,
     precision: str,
     pooling: str,
+    activations: str = "relu",
     normalisation: str,
     device: str | torch.device,
 ) -> Encoder:
@@ -254,6 +264,7 @@ def build(
         name,
         weights,
         pooling=pooling,
+        activations=activations,
         mean=PAPER_MEAN if paper else None,
         std=PAPER_STD if paper else None,
     )
