@@ -63,6 +63,15 @@ def test_the_rate_rises_then_falls_or_goes_down_in_the_papers_steps():
     assert learning_rate(paper, 250) == pytest.approx(5e-4 * 0.81)
 
 
+def test_a_short_run_goes_as_far_as_the_one_that_its_rate_is_meant_for():
+    whole = OptimConfig(steps=1000, rate=5e-4, schedule="step", nominal_steps=1000)
+    short = dataclasses.replace(whole, steps=200)
+    assert learning_rate(whole, 250) == pytest.approx(5e-4 * 0.81)
+    assert learning_rate(short, 50) == pytest.approx(5 * 5e-4 * 0.81)
+    gone = [sum(learning_rate(each, step) for step in range(each.steps)) for each in (whole, short)]
+    assert gone[1] == pytest.approx(gone[0])
+
+
 def test_a_normalised_gradient_has_length_one_and_its_own_direction():
     field = torch.nn.Linear(3, 2)
     (field(torch.ones(3)) * torch.tensor([1e4, -3e3])).sum().backward()

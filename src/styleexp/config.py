@@ -270,6 +270,10 @@ class OptimConfig:
     so that the last steps settle."""
     decay: float = 0.9
     decay_every: int = 100
+    nominal_steps: int | None = None
+    """``step``: the length of run that ``rate`` and ``decay_every`` are meant for. A run of other
+    ``steps`` has its rate raised and its decays brought closer by the same factor, so that a short
+    run goes as far as a long one. null: taken as they are."""
     seed: int = 0
     unit_gradient: bool = True
     """Bring every step's gradient to the same length: otherwise a view that shows only a few cells
@@ -390,6 +394,7 @@ BETWEEN = {
     "views.local.extent": (1e-3, 1e3),
     "loss.bank_views": (1, 1_000_000),
     "optim.steps": (1, 1_000_000_000),
+    "optim.nominal_steps": (1, 1_000_000_000),
     "preview.turntable_frames": (1, 10_000),
     "metrics.windows": (1, 100_000),
     "style.image_contrast": (0.0, 0.5),

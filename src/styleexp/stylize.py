@@ -300,7 +300,9 @@ def blank(seen: Images) -> int:
 def learning_rate(optim: OptimConfig, step: int) -> float:
     """The rate of a step: see ``OptimConfig.schedule``."""
     if optim.schedule == "step":
-        return optim.rate * optim.decay ** (step // optim.decay_every)
+        shorter = (optim.nominal_steps or optim.steps) / optim.steps
+        decays = math.floor(step * shorter / optim.decay_every)
+        return optim.rate * shorter * optim.decay**decays
     rising = min(1.0, (step + 1) / (WARM_UP * optim.steps))
     falling = 0.5 * (1 + math.cos(math.pi * step / optim.steps))
     return optim.rate * rising * (0.05 + 0.95 * falling)
