@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import json
 import sys
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -138,7 +139,8 @@ def draw(runs: list[tuple[str, list[dict[str, Any]]]], path: Path) -> None:
         steps = [row["step"] for row in rows]
         left.plot(steps, [row["rms"] for row in rows], "o-", label="root mean square")
         left.plot(steps, [row["mean_displacement"] for row in rows], "s-", label="mean")
-        left.set(title=title, xlabel="step", ylabel="displacement, radii", ylim=(-0.105, 0.105))
+        left.set(xlabel="step", ylabel="displacement, radii", ylim=(-0.105, 0.105))
+        left.set_title(textwrap.fill(title, 58), fontsize=8)
         left.axhline(0, color="grey", lw=0.5)
         left.legend(fontsize=8)
         middle.plot(steps, [row["signal"] for row in rows], "o-", label="signal")
@@ -148,7 +150,7 @@ def draw(runs: list[tuple[str, list[dict[str, Any]]]], path: Path) -> None:
         middle.legend(fontsize=8)
         last = rows[-1]["parts"]
         if not last:
-            right.text(0.5, 0.5, "foreground alone", ha="center")
+            right.text(0.5, 0.5, "no outline or background in the loss", ha="center")
             right.set_axis_off()
             continue
         for k, part in enumerate(PARTS):

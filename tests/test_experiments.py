@@ -97,6 +97,7 @@ def test_every_job_of_every_experiment_is_valid(path):
 SETS = {
     "robust": {},
     "paper": {},
+    "paper_amended": {},
     "vertex": {},
     "text2mesh": {},
     "displacement_map": {"baseline": "displacement_map"},
@@ -111,13 +112,17 @@ def test_a_method_sets_what_its_file_says_and_nothing_of_the_default(name):
     assert {path.stem for path in (CONF / "method").glob("*.yaml")} == set(SETS)
     sized = ["views.local.per_view"]  # by the profile, which comes after
     body = OmegaConf.to_container(OmegaConf.load(CONF / "method" / f"{name}.yaml"))
-    parts = dict(next(iter(each.items())) for each in body.pop("defaults", []))
+    chosen = [each for each in body.pop("defaults", []) if isinstance(each, dict)]
+    parts = dict(next(iter(each.items())) for each in chosen)
     parts = {key.removeprefix("override /"): value for key, value in parts.items()}
     made, robust = (compose([*GIVEN, f"method={each}"]) for each in (name, "robust"))
     assert (made.baseline and made.baseline.name) == SETS[name].get("baseline")
     assert made.source.refine == SETS[name].get("source.refine", "none")
     assert all(getattr(made, part).name == chosen for part, chosen in parts.items())
     made, robust = (dict(flat(asdict(each))) for each in (made, robust))
+    if name == "paper_amended":
+        paper = OmegaConf.load(CONF / "method" / "paper.yaml")
+        body = OmegaConf.to_container(OmegaConf.merge(paper, body))
     own = {key: value for key, value in flat(body) if key not in sized}
     assert own.items() <= made.items()
     differing = {key for key in made.keys() | robust.keys() if made.get(key) != robust.get(key)}
@@ -181,6 +186,33 @@ def test_every_switch_between_the_methods_has_its_file():
     names = {name.strip() for name in swept["+switch"].split(",")}
     files = {path.stem for path in (CONF / "switch").glob("*.yaml")}
     assert names == files - {"image_tone"}
+
+
+@pytest.mark.parametrize(
+    ("experiment", "group"), [("method_ablation", "switch"), ("readings", "reading")]
+)
+def test_every_job_of_an_ablation_differs_from_its_first_by_its_file_alone(experiment, group):
+    first, *others = (
+        (overrides, dict(flat(asdict(compose([*overrides, "hydra.mode=RUN"])))))
+        for overrides in experiment_jobs([f"+experiment={experiment}"])
+    )
+    source, style = (f"{key}={first[1][f'{key}.name']}" for key in ("source", "style"))
+    paper = dict(flat(asdict(compose([source, style, "method=paper"]))))
+    names = set()
+    for overrides, made in others:
+        (name,) = (each.partition("=")[2] for each in overrides if each.startswith(f"+{group}="))
+        names.add(name)
+        body = OmegaConf.to_container(OmegaConf.load(CONF / group / f"{name}.yaml"))
+        if "defaults" in body:
+            assert made == paper
+            continue
+        own = dict(flat(body))
+        assert own.items() <= made.items()
+        differing = {key for key in made if made[key] != first[1][key]}
+        assert differing
+        assert differing <= own.keys()
+    files = {path.stem for path in (CONF / group).glob("*.yaml")}
+    assert names | {"robust", "amended", "image_tone"} >= files
 
 
 def test_a_failed_job_under_joblib_fails_the_sweep_and_is_in_the_table(tmp_path):
