@@ -50,8 +50,8 @@ class StyleConfig:
     """Size of the pattern on the result: 2 makes its features twice as large."""
     scale_by: str = "area"
     """What ``scale`` 1 means. ``area``: the result carries as many features as the style mesh, as
-    lengths go by the square root of the surface; ``field.sigma`` and ``field.bound`` then go with
-    the pattern, too. ``frame``: both meshes fill the unit sphere, as in the paper."""
+    lengths go by the square root of the surface. ``frame``: both meshes fill the unit sphere, as in the paper, and a picture
+    fills the views unless ``loss.target`` is ``bank``."""
     direction: str = "auto"
     """Which way the pattern's up points (``method=synthesis``). ``up``, ``x``, ``y``, ``z``: along
     that axis wherever the surface allows it (``up`` is ``y``). ``flow``: smoothly along the form.
@@ -98,9 +98,11 @@ class FieldConfig:
     """The displacement field: an MLP on Fourier features (Sec. 3.2, Eq. 1)."""
 
     name: str = "fourier_mlp"
+    unit: str = "style"
+    """The radius that ``sigma`` and ``bound`` are measured in: the ``style``'s, so that with
+    ``style.scale_by=area`` they go with the pattern, or the ``source``'s, as in the paper."""
     sigma: float | None = None
-    """Standard deviation of the frequency matrix B (Fig. 7), in cycles per radius; see
-    ``style.scale_by``. null: the root mean square frequency of the style mesh's relief, or of the
+    """Standard deviation of the frequency matrix B (Fig. 7), in cycles per radius. null: the root mean square frequency of the style mesh's relief, or of the
     picture's tone. The paper has 5."""
     features: int = 128
     """Rows of B; the encoding has twice as many entries (h_f = 256)."""
@@ -118,7 +120,7 @@ class FieldConfig:
     """What keeps displacements within the bound: ``tanh``, or ``clamp``, which has no gradient at
     the bound."""
     bound: float | None = None
-    """Displacements lie in (-bound, bound), in radii; see ``style.scale_by``. null: twice what the
+    """Displacements lie in (-bound, bound), in radii. null: twice what the
     style mesh's own relief needs; of a picture, which doesn't tell its height, twice 0.15 of its
     wavelength. The paper has 0.1."""
     start: str = "map"
@@ -239,8 +241,9 @@ class LossConfig:
     lambda_global: float = 0.3
     lambda_local: float = 1.0
     """lambda of Eq. 7 (paper: 0.1)."""
-    masked: bool = True
-    """Grams over the foreground only, divided by its area, not over the whole frame."""
+    masked: Any = True
+    """Grams over the foreground only, divided by its area, not over the whole frame. ``pictures``:
+    only where the style is a picture, which has no background to compare with."""
     erosion: int = 2
     """Cells taken off the mask's rim at every layer; they see the background."""
     relative: str = "source"
@@ -250,8 +253,8 @@ class LossConfig:
     target: str = "bank"
     """``bank``: the style's Grams are averaged once over a bank of views. ``same_views``: the style
     mesh is rendered at the result's views in every step, as in the paper; ``own_views``: at random
-    views of its own. ``whole``: the same as ``same_views``, but
-    a picture is the target of local views as a whole, too, not in crops, as in Text2Mesh."""
+    views of its own. ``whole``: as ``same_views``, but a picture is the target of local views as a
+    whole, too, not in crops, as in Text2Mesh."""
     bank_views: int = 24
     relief_weight: float = 1.0
     """Weight of mean((d / r)^4), where r is half the range of the style's relief: keeps the
@@ -353,10 +356,12 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "views.local.mode": ("image", "zoom", "surface"),
     "views.local.crop": ("side", "area"),
     "views.local.perspective": ("after", "before"),
+    "field.unit": ("style", "source"),
     "field.last_layer": ("zero", "random"),
     "field.limit": ("tanh", "clamp"),
     "shading.light_frame": ("camera", "world"),
     "encoder.activations": ("relu", "conv"),
+    "loss.masked": (True, False, "pictures"),
     "loss.normalisation": ("none", "cells", "channels_cells", "mean"),
     "shading.normals": ("flat", "smooth"),
     "shading.lights": (1, 3),

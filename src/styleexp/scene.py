@@ -7,7 +7,7 @@ style loss needs.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -137,8 +137,11 @@ def load(
     if heights is not None and heights.in_proportion:
         height = pictures.spread(heights.height) * height_maps.picture_side(config, unit) / size
         bound = BOUND_MARGIN * height if config.field.bound is None else bound
+    given_size = 1.0 if config.field.unit == "source" else size
+    sigma /= size if config.field.sigma is None else given_size
+    bound *= size if config.field.bound is None else given_size
     if config.source.refine != "none" and not smooth:
-        source = refined(source, size / sigma, config.source.refine)
+        source = refined(source, 1 / sigma, config.source.refine)
     frame, surface = normalised(source, device)
     areas = vertex_areas(surface)
     mask, told = placed(config.style, source, areas)
@@ -154,15 +157,15 @@ def load(
         areas=areas,
         mask=mask,
         unit=unit,
-        sigma=sigma / size,
-        bound=bound * size,
+        sigma=sigma,
+        bound=bound,
         relief=height * size,
         notes=(
             *source.repairs,
             *(f"style: {repair}" for repair in getattr(style, "repairs", ())),
             *stray_faces("source", source),
             *(stray_faces("style", style) if isinstance(style, meshes.Mesh) else ()),
-            *too_coarse(source, size / sigma),
+            *too_coarse(source, 1 / sigma),
             *told,
             *mistaken(config, style, heights),
             *(no_relief(config.style) if smooth else ()),
@@ -216,7 +219,10 @@ def prepare(config: Config) -> Scene:
     grey = foreground_mean(config, renderer, surface)
     shading = choose_shading(config, grey)
     encoder = build("encoder", config.encoder, device=device, seed=config.optim.seed)
-    loss = build("loss", config.loss, encoder=encoder)
+    loss_config = config.loss
+    if loss_config.masked == "pictures":
+        loss_config = replace(loss_config, masked=isinstance(style, np.ndarray))
+    loss = build("loss", loss_config, encoder=encoder)
     lights = config.shading.lights if isinstance(style, meshes.Mesh) else 1
     viewer = Viewer(config, renderer, shading, surface, lights=lights)
 
@@ -242,7 +248,8 @@ def prepare(config: Config) -> Scene:
             target = measured(styled, unit)
     else:
         picture = styles.tone(torch.from_numpy(style).to(device), grey, config.style)
-        if config.loss.target != "bank":
+        in_frame = config.loss.target != "bank" and config.style.scale_by == "frame"
+        if in_frame or config.loss.target == "whole":
             bank = styles.whole_image_bank(picture, config)
         else:
             bank = styles.image_bank(picture, config, unit)
