@@ -50,8 +50,8 @@ class StyleConfig:
     """Size of the pattern on the result: 2 makes its features twice as large."""
     scale_by: str = "area"
     """What ``scale`` 1 means. ``area``: the result carries as many features as the style mesh, as
-    lengths go by the square root of the surface. ``frame``: both meshes fill the unit sphere, as in the paper, and a picture
-    fills the views unless ``loss.target`` is ``bank``."""
+    lengths go by the square root of the surface. ``frame``: both meshes fill the unit sphere, as in
+    the paper, and a picture fills the views unless ``loss.target`` is ``bank``."""
     direction: str = "auto"
     """Which way the pattern's up points (``method=synthesis``). ``up``, ``x``, ``y``, ``z``: along
     that axis wherever the surface allows it (``up`` is ``y``). ``flow``: smoothly along the form.
@@ -102,8 +102,8 @@ class FieldConfig:
     """The radius that ``sigma`` and ``bound`` are measured in: the ``style``'s, so that with
     ``style.scale_by=area`` they go with the pattern, or the ``source``'s, as in the paper."""
     sigma: float | None = None
-    """Standard deviation of the frequency matrix B (Fig. 7), in cycles per radius. null: the root mean square frequency of the style mesh's relief, or of the
-    picture's tone. The paper has 5."""
+    """Standard deviation of the frequency matrix B (Fig. 7), in cycles per radius. null: the root
+    mean square frequency of the style mesh's relief, or of the picture's tone. The paper has 5."""
     features: int = 128
     """Rows of B; the encoding has twice as many entries (h_f = 256)."""
     include_input: bool = False
