@@ -135,6 +135,16 @@ def test_same_as_the_plain_network(pooling, size):
         assert (activation == 0).any(), "post-ReLU activations have zeros"
 
 
+def test_activations_before_the_relu_give_those_after_it():
+    after, before = tiny(), tiny(activations="conv")
+    names = after.layer_names
+    linear = before(images(), names)
+    assert not before.is_fused
+    for name, activation in after(images(), names).items():
+        torch.testing.assert_close(linear[name].relu(), activation)
+        assert (linear[name] < 0).any()
+
+
 def test_gradient_is_that_of_the_plain_network():
     """In-place ReLUs must not disturb what the backward pass needs."""
     encoder = tiny().double()

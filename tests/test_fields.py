@@ -80,6 +80,21 @@ def test_starts_at_the_source_and_keeps_its_bound():
     assert field(encoded).max().item() == pytest.approx(0.1)
 
 
+def test_a_last_layer_at_random_starts_beside_the_source():
+    field = DisplacementField(FieldConfig(last_layer="random"), generator(), 5.0, 0.1)
+    displacement = field(field.encode(torch.rand(50, 3, generator=generator(1))))
+    assert displacement.std() > 0
+    assert displacement.abs().max() < 0.1
+
+
+def test_a_clamp_keeps_the_bound_without_bending_what_is_within():
+    field = DisplacementField(FieldConfig(limit="clamp", zero_mean=False), generator(), 5.0, 0.1)
+    encoded = field.encode(torch.rand(5, 3, generator=generator(1)))
+    for latent, displacement in ((0.5, 0.05), (-0.9, -0.09), (3.0, 0.1), (-3.0, -0.1)):
+        torch.nn.init.constant_(field.last.bias, latent)
+        torch.testing.assert_close(field(encoded), torch.full((5,), displacement))
+
+
 @pytest.mark.parametrize("zero_mean", [True, False])
 def test_a_drift_of_the_mean_saturates_nothing_where_the_mean_is_taken_off(zero_mean):
     field = DisplacementField(FieldConfig(zero_mean=zero_mean), generator(), 5.0, 0.1)

@@ -26,6 +26,18 @@ def test_masked_gram_sees_the_foreground_alone_and_not_how_large_it_is():
     torch.testing.assert_close(gram_matrix(features, mask), masked)
 
 
+def test_gram_is_divided_as_asked():
+    features, mask = torch.rand(3, 4, 5, 6), torch.rand(3, 5, 6) < 0.5
+    product = torch.einsum("vchw,vdhw,vhw->cd", features, features, mask.float())
+    for how, divisor in (
+        ("none", 1),
+        ("cells", mask.sum()),
+        ("channels_cells", 4 * mask.sum()),
+        ("mean", 16 * mask.sum()),
+    ):
+        torch.testing.assert_close(gram_matrix(features, mask, how), product / divisor)
+
+
 def test_empty_mask_gives_zeros_not_nan():
     mask = torch.zeros(1, 8, 8, dtype=torch.bool)
     assert (gram_matrix(torch.rand(1, 4, 8, 8), mask) == 0).all()

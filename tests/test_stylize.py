@@ -6,6 +6,7 @@ import itertools
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import styleexp
 from styleexp.compose import compose
@@ -42,6 +43,68 @@ def test_robust_and_paper_run_and_displace_along_the_normals():
         normals = result.scene.surface.normals.numpy()
         np.testing.assert_allclose(moved, result.displacement[:, None] * normals, atol=1e-6)
         assert np.abs(result.displacement).max() <= 0.1 * result.scene.frame.scale
+
+
+def viewed(*overrides):
+    scene = prepare(compose([*SMOKE, "source=sphere", "style=bubble", "method=paper", *overrides]))
+    return scene, scene.viewer(scene.surface.vertices, 0)
+
+
+def test_a_perspective_brings_in_the_background_unless_a_fill_is_given():
+    for fill, grey in (("null", 0.7), ("0.2", 0.2)):
+        _, (whole, _) = viewed(
+            "shading.background=0.7",
+            f"views.perspective_fill={fill}",
+            "views.perspective_probability=1",
+        )
+        assert whole.image[:, 0, 0].min() == pytest.approx(grey, abs=1e-4)
+        assert whole.coverage[:, 0, 0].max() < 1e-4
+
+
+def test_a_perspective_before_the_crop_is_that_of_the_whole_view():
+    crops = "views.local.share=1", "views.local.size=64", "views.perspective_probability=1"
+    for when in ("before", "after"):
+        _, (whole, local) = viewed(*crops, f"views.local.perspective={when}")
+        assert torch.allclose(local.image, whole.image, atol=1e-5) == (when == "before")
+
+
+def test_a_light_in_the_camera_shows_a_sphere_alike_from_all_sides():
+    for frame in ("camera", "world"):
+        _, (whole, _) = viewed(
+            f"shading.light_frame={frame}", "views.perspective=0", "shading.normals=smooth"
+        )
+        first, second = whole.image[:, 16:48, 16:48]
+        assert ((first - second).abs().max() < 0.02) == (frame == "camera")
+
+
+def test_the_style_can_be_seen_at_views_of_its_own():
+    (same, _), (own, _) = viewed(), viewed("loss.target=own_views")
+    differing = [
+        not torch.equal(a, b) for a, b in zip(same.target(0)[0], own.target(0)[0], strict=True)
+    ]
+    assert all(differing)
+    assert torch.equal(own.target(0)[0][0], own.target(0)[0][0])
+
+
+def test_the_foreground_alone_can_be_for_pictures(tmp_path):
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (64, 64), np.uint8)).save(
+        tmp_path / "noise.png"
+    )
+    mesh, picture = (
+        prepare(compose([*SMOKE, "source=sphere", *style, "method=paper_amended"]))
+        for style in (["style=bubble"], [f"style.path={tmp_path / 'noise.png'}"])
+    )
+    assert not mesh.loss.config.masked
+    assert picture.loss.config.masked
+
+
+def test_sigma_and_bound_are_in_the_radii_asked_for():
+    size = {}
+    for unit in ("style", "source"):
+        scene, _ = viewed(f"field.unit={unit}", "style.scale_by=area", "source=torus")
+        size[unit] = scene.sigma / 5, scene.bound / 0.1
+    assert size["source"] == (1, 1)
+    assert size["style"] == pytest.approx((1 / scene.unit, scene.unit))
 
 
 def test_same_seed_gives_the_same_mesh_and_another_seed_another():
