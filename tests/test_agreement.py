@@ -2,20 +2,13 @@
 
 import json
 import os
-import subprocess
-import sys
 
 
 def sweep(folder, renderers, *flags, **environment):
     arguments = ["+experiment=backend_agreement", "source=torus", "profile=smoke", "optim.steps=8"]
     arguments += ["encoder=vgg19_random", f"renderer={renderers}", "hydra.sweep.dir=all"]
-    done = subprocess.run(
-        [sys.executable, "-m", "styleexp", *flags, *arguments],
-        cwd=folder,
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        check=False,
+    done = warm.run(
+        "-m", "styleexp", *flags, *arguments, cwd=folder, env={**os.environ, **environment}
     )
     return done, json.loads((folder / "all" / "agreement.json").read_text())
 

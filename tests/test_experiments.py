@@ -4,12 +4,11 @@ import csv
 import json
 import os
 import re
-import subprocess
-import sys
 from dataclasses import asdict
 from pathlib import Path
 
 import pytest
+import warm
 from omegaconf import OmegaConf
 from PIL import Image
 
@@ -32,14 +31,7 @@ each_experiment = pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: 
 
 
 def styleexp(*arguments, cwd, **environment):
-    return subprocess.run(
-        [sys.executable, "-m", "styleexp", *arguments],
-        cwd=cwd,
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    return warm.run("-m", "styleexp", *arguments, cwd=cwd, env={**os.environ, **environment})
 
 
 def flat(tree, prefix=""):

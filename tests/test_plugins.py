@@ -9,6 +9,7 @@ import textwrap
 from pathlib import Path
 
 import pytest
+import warm
 
 ROOT = Path(__file__).parent.parent
 SMOKE = ["source=torus", "method=robust", "profile=smoke", "hydra.run.dir=run"]
@@ -171,12 +172,15 @@ def installed(tmp_path_factory):
     return folder
 
 
-def process(*command, cwd, path=None, **variables):
+def process(program, *arguments, cwd, path=None, **variables):
+    """Of this interpreter, forked from one that has loaded all; any other program as it is."""
     environment = {**os.environ, **variables}
     if path is not None:
         environment["PYTHONPATH"] = str(path)
+    if program == sys.executable and arguments[0] in ("-c", "-m") and arguments[1] != "pip":
+        return warm.run(*arguments, cwd=cwd, env=environment)
     return subprocess.run(
-        [str(part) for part in command],
+        [str(part) for part in (program, *arguments)],
         cwd=cwd, env=environment, capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
 

@@ -2,12 +2,11 @@
 
 import json
 import random
-import subprocess
-import sys
 import time
 
 import numpy as np
 import pytest
+import warm
 from browser import browser, check_quiet, covered, pixels, wait
 
 EVIL = "<img src=x onerror=alert(1)>"
@@ -16,17 +15,11 @@ PARTICIPANTS = 20
 
 
 def styleexp(*arguments, cwd):
-    return subprocess.run(
-        [sys.executable, "-m", "styleexp", *map(str, arguments)],
-        cwd=cwd, capture_output=True, text=True, timeout=300, check=False,
-    )  # fmt: skip
+    return warm.run("-m", "styleexp", *arguments, cwd=cwd)
 
 
 def report(*arguments, cwd):
-    done = subprocess.run(
-        [sys.executable, "-m", "styleexp.cli.report", *map(str, arguments)],
-        cwd=cwd, capture_output=True, text=True, timeout=300, check=False,
-    )  # fmt: skip
+    done = warm.run("-m", "styleexp.cli.report", *arguments, cwd=cwd)
     assert done.returncode == 0, done.stderr
     return done
 
