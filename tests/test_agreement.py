@@ -1,14 +1,13 @@
 """``+experiment=backend_agreement``: a real sweep over the backends that are installed."""
 
 import json
-import os
 
 
 def sweep(folder, renderers, *flags, **environment):
     arguments = ["+experiment=backend_agreement", "source=torus", "profile=smoke", "optim.steps=8"]
     arguments += ["encoder=vgg19_random", f"renderer={renderers}", "hydra.sweep.dir=all"]
     done = warm.run(
-        "-m", "styleexp", *flags, *arguments, cwd=folder, env={**os.environ, **environment}
+        "-m", "styleexp", *flags, *arguments, cwd=folder, env=warm.coarse(**environment)
     )
     return done, json.loads((folder / "all" / "agreement.json").read_text())
 

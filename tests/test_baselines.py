@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import sys
 import textwrap
 
@@ -30,7 +29,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:the encoder 'vgg19_random'")
 
 
 def command(*arguments, cwd, **variables):
-    return warm.run("-m", "styleexp", *arguments, cwd=cwd, env={**os.environ, **variables})
+    return warm.run("-m", "styleexp", *arguments, cwd=cwd, env=warm.coarse(**variables))
 
 
 def run(*overrides):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import warnings
@@ -131,7 +130,7 @@ def test_a_crash_there_is_an_error_here(critter, monkeypatch, tmp_path):
 
 
 def command(*arguments, cwd, **environment):
-    environment = {**os.environ, **environment}
+    environment = warm.coarse(**environment)
     return warm.run(
         "-m", "styleexp", *SMOKE, *arguments, "hydra.run.dir=run", cwd=cwd, env=environment
     )

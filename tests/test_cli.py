@@ -18,7 +18,7 @@ SMOKE = ["method=robust", "profile=smoke", "encoder=vgg19_random"]
 
 def command(*arguments, cwd, env=None):
     """Run `styleexp` and return the finished process."""
-    return warm.run("-m", "styleexp", *arguments, cwd=cwd, env=env)
+    return warm.run("-m", "styleexp", *arguments, cwd=cwd, env=env or warm.coarse())
 
 
 def fresh_command(*arguments, cwd, **more):
@@ -77,7 +77,7 @@ def test_kill_and_resume_is_bit_identical(finished, tmp_path):
     arguments.append(f"hydra.run.dir={folder}")
     undisturbed = tmp_path / "whole"
     assert command(*arguments[:-1], f"hydra.run.dir={undisturbed}", cwd=tmp_path).returncode == 0
-    process = warm.start("-m", "styleexp", *arguments, cwd=tmp_path)
+    process = warm.start("-m", "styleexp", *arguments, cwd=tmp_path, env=warm.coarse())
     lines = folder / "metrics.jsonl"
     deadline = time.monotonic() + 240
     while not (lines.exists() and lines.read_text().count("\n") >= 5):
@@ -102,7 +102,7 @@ def test_interrupt_checkpoints_and_says_how_to_go_on(tmp_path):
     folder = tmp_path / "run"
     process = warm.start(
         "-m", "styleexp", "source=torus", "style=bubble", *SMOKE, "optim.steps=400",
-        f"hydra.run.dir={folder}", cwd=tmp_path, stdout=warm.PIPE,
+        f"hydra.run.dir={folder}", cwd=tmp_path, env=warm.coarse(), stdout=warm.PIPE,
     )  # fmt: skip
     lines = folder / "metrics.jsonl"
     deadline = time.monotonic() + 240
@@ -122,7 +122,8 @@ def test_an_interrupted_synthesis_says_how_to_run_it_again(tmp_path):
     folder = tmp_path / "run"
     process = warm.start(
         "-m", "styleexp", "torus", "bubble", "source.refine=40000", "report=false",
-        f"hydra.run.dir={folder}", cwd=tmp_path, stdout=warm.PIPE, stderr=warm.PIPE,
+        f"hydra.run.dir={folder}", cwd=tmp_path, env=warm.coarse(), stdout=warm.PIPE,
+        stderr=warm.PIPE,
     )  # fmt: skip
     assert process.stdout is not None
     assert any("wavelength" in line for line in process.stdout)  # it is at work
@@ -364,7 +365,13 @@ def with_seam(mesh, path):
 def test_a_closed_pipe_is_an_interruption_that_can_be_resumed(tmp_path):
     arguments = ["source=torus", "style=bubble", *SMOKE, "optim.steps=20", "hydra.run.dir=run"]
     process = warm.start(
-        "-m", "styleexp", *arguments, cwd=tmp_path, stdout=warm.PIPE, stderr=warm.PIPE
+        "-m",
+        "styleexp",
+        *arguments,
+        cwd=tmp_path,
+        env=warm.coarse(),
+        stdout=warm.PIPE,
+        stderr=warm.PIPE,
     )
     assert process.stdout is not None
     process.stdout.readline()

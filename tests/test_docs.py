@@ -58,7 +58,7 @@ def test_the_tutorials_commands_run(tmp_path):
             arguments += [*SMALL, *(LEARNED if "method=robust" in arguments else BY_SYNTHESIS)]
         if name == "styleexp-metrics":
             arguments += ["--judge", "none"]
-        done = warm.run("-m", module, *arguments, cwd=tmp_path)
+        done = warm.run("-m", module, *arguments, cwd=tmp_path, env=warm.coarse())
         assert done.returncode == 0, (name, arguments, done.stderr)
     assert {path.name for path in (tmp_path / "outputs").iterdir()} == {"first", "two", "learned"}
     for told in ("first/report.html", "learned/result.glb", "two/table.csv", "two/figure.png",

@@ -36,7 +36,7 @@ main()
 
 
 def styleexp(*arguments, cwd):
-    return warm.run("-c", STOPPED, *arguments, cwd=cwd)
+    return warm.run("-c", STOPPED, *arguments, cwd=cwd, env=warm.coarse())
 
 
 def at_once(*commands, cwd):
@@ -285,7 +285,9 @@ def test_a_plan_refuses_another_run_in_a_jobs_folder(swept, tmp_path):
 
     ((job,),) = plan.jobs(plan.read(tmp_path / "plan.yaml"), tmp_path / "out").values()
     shutil.copytree(swept[0] / "all" / "1", job.folder)
-    done = warm.run("-m", main.__module__, "plan.yaml", "--folder", "out", cwd=tmp_path)
+    done = warm.run(
+        "-m", main.__module__, "plan.yaml", "--folder", "out", cwd=tmp_path, env=warm.coarse()
+    )
     told = complaint(done)
     assert job.name in told
     assert "is not this plan's" in told

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
-import os
 import subprocess
 from dataclasses import replace
 from functools import cache
@@ -186,7 +185,7 @@ def _command(folder, *arguments: str, **environment: str) -> subprocess.Complete
         "profile=smoke",
         "encoder=vgg19_random",
     ]
-    environment = {**os.environ, **environment}
+    environment = warm.coarse(**environment)
     return warm.run(
         "-m", "styleexp", "renderer=mitsuba_ad", *smoke, *arguments, cwd=folder, env=environment
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import subprocess
 import sys
 import threading
@@ -234,7 +233,7 @@ except UserError as error:
 
 
 def command(*arguments, cwd, **environment):
-    environment = {**os.environ, **environment}
+    environment = warm.coarse(**environment)
     return warm.run(
         "-m", "styleexp", *arguments, *SMOKE, "hydra.run.dir=run", cwd=cwd, env=environment
     )

@@ -18,7 +18,7 @@ SMOKE = ["method=robust", "profile=smoke", "encoder=vgg19_random", "report=false
 
 
 def run(module, *arguments, cwd):
-    return warm.run("-m", module, *arguments, cwd=cwd)
+    return warm.run("-m", module, *arguments, cwd=cwd, env=warm.coarse())
 
 
 def complaint(done):
@@ -46,7 +46,7 @@ def interrupted(tmp_path_factory):
     save("torus", home / "t.ply")
     process = warm.start(
         "-m", "styleexp", "source.path=t.ply", "style=bubble", *SMOKE, "optim.steps=400",
-        "hydra.run.dir=run", cwd=home, stdout=warm.PIPE,
+        "hydra.run.dir=run", cwd=home, env=warm.coarse(), stdout=warm.PIPE,
     )  # fmt: skip
     lines = home / "run" / "metrics.jsonl"
     until = time.monotonic() + 240

@@ -41,8 +41,8 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-def command(*given, cwd, env=None):
-    return warm.run("-m", "styleexp", *given, cwd=cwd, env=env)
+def command(*given, cwd, **variables):
+    return warm.run("-m", "styleexp", *given, cwd=cwd, env=warm.coarse(**variables))
 
 
 @pytest.mark.parametrize("name", NAMES, ids=ascii)
@@ -103,7 +103,7 @@ def test_odd_names_run_in_a_sweep_with_workers_and_keep_their_own_results(here):
     done = command(
         "-m", "source.path=" + ",".join(HARDEST), "style=bubble", *CHEAP,
         "launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweep.dir=out (1)", cwd=here,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        OMP_NUM_THREADS="1",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     records = [json.loads(p.read_text()) for p in sorted((here / "out (1)").glob("*/run.json"))]
@@ -121,7 +121,7 @@ def test_odd_names_run_in_a_plan(here):
     }
     (here / "plan.yaml").write_text(json.dumps(plan))
     code = "import sys; from styleexp.cli.sweep import main; sys.exit(main())"
-    done = warm.run("-c", code, "plan.yaml", cwd=here)
+    done = warm.run("-c", code, "plan.yaml", cwd=here, env=warm.coarse())
     assert done.returncode == 0, done.stderr + done.stdout
     assert warm.run("-c", code, "collect", "outputs/plan", cwd=here).returncode == 0
     with open(here / "outputs/plan/runs.csv", newline="", encoding="utf-8") as file:

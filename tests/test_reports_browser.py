@@ -15,7 +15,7 @@ PARTICIPANTS = 20
 
 
 def styleexp(*arguments, cwd):
-    return warm.run("-m", "styleexp", *arguments, cwd=cwd)
+    return warm.run("-m", "styleexp", *arguments, cwd=cwd, env=warm.coarse())
 
 
 def report(*arguments, cwd):

@@ -9,7 +9,7 @@ pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="needs the extr
 def search(cwd, *more):
     return warm.run(
         "-m", "styleexp", "+search=optuna", "source=torus", "style=bubble", "profile=smoke",
-        "encoder=vgg19_random", "hydra.sweep.dir=all", *more, cwd=cwd,
+        "encoder=vgg19_random", "hydra.sweep.dir=all", *more, cwd=cwd, env=warm.coarse(),
     )  # fmt: skip
 
 

@@ -149,7 +149,7 @@ def test_the_command_says_so_once_and_nothing_of_what_an_experiment_chose(small,
     def lines(*arguments):
         done = warm.run(
             "-m", "styleexp", "--config-dir", "conf", "+experiment=two", *small, *few, *arguments,
-            cwd=tmp_path,
+            cwd=tmp_path, env=warm.coarse(),
         )  # fmt: skip
         assert done.returncode == 0, done.stderr
         return [line for line in done.stdout.splitlines() if "effect" in line]

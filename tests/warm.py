@@ -52,6 +52,16 @@ than the number of threads: that is the forked process's own."""
 # ---------------------------------------------------------------------------------------- for tests
 
 
+COARSE = Path(__file__).parent / "coarse"
+
+
+def coarse(**variables: str) -> dict[str, str]:
+    """This process's environment, these variables, and coarse shapes (``coarse/sitecustomize.py``):
+    for runs whose result nobody looks at closely."""
+    path = os.pathsep.join(filter(None, [str(COARSE), variables.get("PYTHONPATH", "")]))
+    return {**os.environ, **variables, "PYTHONPATH": path}
+
+
 def run(
     *words: object,
     cwd: Path | str | None = None,
@@ -281,8 +291,15 @@ def _become(asked: dict[str, Any]) -> None:
     module = asked["kind"] == "-m"
     first = asked["cwd"] if module else ""
     sys.path[:] = [first, *added, *(path for path in sys.path[1:] if path not in added)]
+    if str(COARSE) in added:
+        import sitecustomize
+
+        from styleexp import shapes
+
+        sitecustomize.coarsen(shapes)
     sys.argv[:] = [asked["kind"], *asked["arguments"]]
     if module:
+        sys.modules.pop(asked["what"], None)  # runpy warns of what was loaded under its own name
         runpy.run_module(asked["what"], run_name="__main__", alter_sys=True)
         return
     main = types.ModuleType("__main__")
