@@ -2,6 +2,8 @@
 
 import json
 
+import warm
+
 
 def sweep(folder, renderers, *flags, **environment):
     arguments = ["+experiment=backend_agreement", "source=torus", "profile=smoke", "optim.steps=8"]

@@ -172,21 +172,22 @@ def installed(tmp_path_factory):
     return folder
 
 
-def process(program, *arguments, cwd, path=None, **variables):
-    """Of this interpreter, forked from one that has loaded all; any other program as it is."""
-    environment = {**os.environ, **variables}
-    if path is not None:
-        environment["PYTHONPATH"] = str(path)
-    if program == sys.executable and arguments[0] in ("-c", "-m") and arguments[1] != "pip":
-        return warm.run(*arguments, cwd=cwd, env=environment)
+def environment(path, variables):
+    found = {**os.environ, **variables}
+    return found if path is None else {**found, "PYTHONPATH": str(path)}
+
+
+def process(*command, cwd, path=None, **variables):
+    """Any program, started anew."""
     return subprocess.run(
-        [str(part) for part in (program, *arguments)],
-        cwd=cwd, env=environment, capture_output=True, text=True, timeout=300, check=False,
+        [str(part) for part in command], cwd=cwd, env=environment(path, variables),
+        capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
 
 
-def styleexp(*arguments, **how):
-    return process(sys.executable, "-m", "styleexp", *arguments, **how)
+def styleexp(*arguments, cwd, path=None, **variables):
+    env = warm.coarse(**environment(path, variables))
+    return warm.run("-m", "styleexp", *arguments, cwd=cwd, env=env)
 
 
 @pytest.fixture(scope="module")

@@ -30,7 +30,7 @@ def runs(tmp_path_factory):
     from styleexp import meshes, shapes
 
     folder = tmp_path_factory.mktemp("runs")
-    torus = shapes.make("torus")
+    torus = shapes.make("torus", detail=2000)
     meshes.save_mesh(torus, torus.vertices, folder / f"{EVIL}.obj")
     done = styleexp(
         f'source.path="{EVIL}.obj"', "style=bubble", *SMOKE, "hydra.run.dir=evil", cwd=folder

@@ -58,8 +58,10 @@ COARSE = Path(__file__).parent / "coarse"
 def coarse(**variables: str) -> dict[str, str]:
     """This process's environment, these variables, and coarse shapes (``coarse/sitecustomize.py``):
     for runs whose result nobody looks at closely."""
-    path = os.pathsep.join(filter(None, [str(COARSE), variables.get("PYTHONPATH", "")]))
-    return {**os.environ, **variables, "PYTHONPATH": path}
+    environment = {**os.environ, **variables}
+    given = environment.get("PYTHONPATH")
+    path = os.pathsep.join([str(COARSE), *([given] if given else [])])
+    return {**environment, "PYTHONPATH": path}
 
 
 def run(
@@ -94,7 +96,7 @@ def start(
         "what": what,
         "arguments": arguments,
         "cwd": str(cwd or os.getcwd()),
-        "env": dict(os.environ if env is None else env),
+        "env": {key: str(value) for key, value in (os.environ if env is None else env).items()},
         "session": start_new_session,
     }
     return Process(asked, stdout, stderr)
