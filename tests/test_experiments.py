@@ -143,7 +143,7 @@ def test_experiment_runs(path, tmp_path):
             for kind in ("mesh", "image"):
                 if name in assets.names(kind) and assets.locate(name, kind) is None:
                     pytest.skip(f"the {kind} '{name}' is in no folder of STYLEEXP_ASSETS")
-    arguments += ["profile=smoke", "encoder=vgg19_random", "hydra.sweep.dir=all", "optim.steps=2"]
+    arguments += ["profile=smoke", "encoder=vgg19_random", "hydra.sweep.dir=all", "optim.steps=3"]
     if path.stem.startswith("baselines"):  # which lay more than one kind of relief on spot
         ball = shapes.make("sphere", detail=1000)
         meshes.save_mesh(ball, ball.vertices, tmp_path / "ball.ply")
