@@ -1,5 +1,7 @@
 # make demo   set up .venv, stylise a mesh on the CPU, say where the result is
 # make test   set up .venv, run every test
+# make test-quick   the tests of geometry, files, losses and fields alone, which run no command: under
+#             two minutes on two cores
 # make lint   ruff and mypy
 # make docs   the documentation, to site/index.html; warnings are errors
 # make conformance   write docs/conformance.md from the checks of every renderer
@@ -28,12 +30,16 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check \
 STRESS_FUZZ ?= 50
 STRESS_SECONDS ?= 3600
 
+# Whose tests test functions, in the tests' own process.
+QUICK := collect fields gltf height_maps losses ply_obj refining relief remembered shapes views \
+	welding
+
 # Two busy cores and spinning OpenMP threads make everything many times slower.
 export OMP_WAIT_POLICY ?= PASSIVE
 # Named meshes and images, where there are some beside the checkout.
 export STYLEEXP_ASSETS ?= $(wildcard $(abspath ../shared))
 
-.PHONY: demo test lint docs conformance stress stress-sweeps stress-folders stress-fuzz stress-faults \
+.PHONY: demo test test-quick lint docs conformance stress stress-sweeps stress-folders stress-fuzz stress-faults \
 	stress-long matrix sbom audit bench-guard ray-test clean
 .DELETE_ON_ERROR:
 
@@ -42,6 +48,9 @@ demo: $(VENV)/.installed
 
 test: $(VENV)/.installed-dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
+
+test-quick: $(VENV)/.installed-dev
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal $(QUICK:%=tests/test_%.py)
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

@@ -40,6 +40,17 @@ def named_mesh():
     return find
 
 
+@pytest.fixture
+def coarse_shapes(monkeypatch):
+    """Analytic shapes of an eighth of their vertices, as commands with `warm.coarse` have."""
+    from styleexp import shapes
+
+    monkeypatch.setattr(shapes, "make", shapes.make)  # to be put back
+    from coarse import sitecustomize
+
+    sitecustomize.coarsen(shapes)
+
+
 @pytest.fixture(scope="session")
 def valid_glbs(tmp_path_factory):
     """Fails in the end if a GLB that was written while it was there is not what glTF allows.

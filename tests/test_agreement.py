@@ -1,21 +1,15 @@
 """``+experiment=backend_agreement``: a real sweep over the backends that are installed."""
 
 import json
-import os
-import subprocess
-import sys
+
+import warm
 
 
 def sweep(folder, renderers, *flags, **environment):
     arguments = ["+experiment=backend_agreement", "source=torus", "profile=smoke", "optim.steps=8"]
     arguments += ["encoder=vgg19_random", f"renderer={renderers}", "hydra.sweep.dir=all"]
-    done = subprocess.run(
-        [sys.executable, "-m", "styleexp", *flags, *arguments],
-        cwd=folder,
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        check=False,
+    done = warm.run(
+        "-m", "styleexp", *flags, *arguments, cwd=folder, env=warm.coarse(**environment)
     )
     return done, json.loads((folder / "all" / "agreement.json").read_text())
 

@@ -1,11 +1,10 @@
 """Baked maps against the meshes that they are of."""
 
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
+import warm
 from PIL import Image
 
 from styleexp import bake, meshes
@@ -69,10 +68,7 @@ def baked(tmp_path_factory):
     normals = vertex_normals(source.vertices, source.faces)
     moved = source.vertices + displacement[:, None] * normals
     write_run(folder / "run", source, displacement, moved)
-    done = subprocess.run(
-        [sys.executable, "-m", "styleexp.cli.bake", folder / "run", "--size", str(SIZE)],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    done = warm.run("-m", "styleexp.cli.bake", folder / "run", "--size", SIZE)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     return source, displacement, moved, folder / "run"

@@ -2,14 +2,13 @@
 
 import json
 import math
-import os
-import subprocess
 import sys
 import textwrap
 
 import numpy as np
 import pytest
 import torch
+import warm
 
 import styleexp
 from styleexp import baselines, meshes, shapes
@@ -30,11 +29,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:the encoder 'vgg19_random'")
 
 
 def command(*arguments, cwd, **variables):
-    return subprocess.run(
-        [sys.executable, "-m", "styleexp", *map(str, arguments)],
-        cwd=cwd, env={**os.environ, **variables}, capture_output=True, text=True, timeout=300,
-        check=False,
-    )  # fmt: skip
+    return warm.run("-m", "styleexp", *arguments, cwd=cwd, env=warm.coarse(**variables))
 
 
 def run(*overrides):

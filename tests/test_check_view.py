@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import warnings
@@ -12,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import warm
 from conftest import available
 from PIL import Image
 
@@ -130,14 +130,9 @@ def test_a_crash_there_is_an_error_here(critter, monkeypatch, tmp_path):
 
 
 def command(*arguments, cwd, **environment):
-    return subprocess.run(
-        [sys.executable, "-m", "styleexp", *SMOKE, *arguments, "hydra.run.dir=run"],
-        cwd=cwd,
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
+    environment = warm.coarse(**environment)
+    return warm.run(
+        "-m", "styleexp", *SMOKE, *arguments, "hydra.run.dir=run", cwd=cwd, env=environment
     )
 
 

@@ -9,23 +9,24 @@ import time
 
 import numpy as np
 import pytest
+import warm
 
 import styleexp
 
 SMOKE = ["method=robust", "profile=smoke", "encoder=vgg19_random"]
 
 
-def command(*arguments, cwd, **more):
+def command(*arguments, cwd, env=None):
     """Run `styleexp` and return the finished process."""
+    return warm.run("-m", "styleexp", *arguments, cwd=cwd, env=env or warm.coarse())
+
+
+def fresh_command(*arguments, cwd, **more):
+    """The same, in an interpreter that starts anew: where that is what the test is about."""
     return subprocess.run(
-        [sys.executable, "-m", "styleexp", *map(str, arguments)],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-        **more,
-    )
+        [sys.executable, "-m", "styleexp", *arguments],
+        cwd=cwd, capture_output=True, text=True, timeout=300, check=False, **more,
+    )  # fmt: skip
 
 
 def complaint(done):
@@ -76,7 +77,7 @@ def test_kill_and_resume_is_bit_identical(finished, tmp_path):
     arguments.append(f"hydra.run.dir={folder}")
     undisturbed = tmp_path / "whole"
     assert command(*arguments[:-1], f"hydra.run.dir={undisturbed}", cwd=tmp_path).returncode == 0
-    process = subprocess.Popen([sys.executable, "-m", "styleexp", *arguments], cwd=tmp_path)
+    process = warm.start("-m", "styleexp", *arguments, cwd=tmp_path, env=warm.coarse())
     lines = folder / "metrics.jsonl"
     deadline = time.monotonic() + 240
     while not (lines.exists() and lines.read_text().count("\n") >= 5):
@@ -99,10 +100,9 @@ def test_kill_and_resume_is_bit_identical(finished, tmp_path):
 
 def test_interrupt_checkpoints_and_says_how_to_go_on(tmp_path):
     folder = tmp_path / "run"
-    process = subprocess.Popen(
-        [sys.executable, "-m", "styleexp", "source=torus", "style=bubble", *SMOKE,
-         "optim.steps=400", f"hydra.run.dir={folder}"],
-        cwd=tmp_path, stdout=subprocess.PIPE, text=True,
+    process = warm.start(
+        "-m", "styleexp", "source=torus", "style=bubble", *SMOKE, "optim.steps=400",
+        f"hydra.run.dir={folder}", cwd=tmp_path, env=warm.coarse(), stdout=warm.PIPE,
     )  # fmt: skip
     lines = folder / "metrics.jsonl"
     deadline = time.monotonic() + 240
@@ -120,10 +120,10 @@ def test_interrupt_checkpoints_and_says_how_to_go_on(tmp_path):
 
 def test_an_interrupted_synthesis_says_how_to_run_it_again(tmp_path):
     folder = tmp_path / "run"
-    process = subprocess.Popen(
-        [sys.executable, "-m", "styleexp", "torus", "bubble", "source.refine=40000",
-         "report=false", f"hydra.run.dir={folder}"],
-        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    process = warm.start(
+        "-m", "styleexp", "torus", "bubble", "source.refine=40000", "report=false",
+        f"hydra.run.dir={folder}", cwd=tmp_path, env=warm.coarse(), stdout=warm.PIPE,
+        stderr=warm.PIPE,
     )  # fmt: skip
     assert process.stdout is not None
     assert any("wavelength" in line for line in process.stdout)  # it is at work
@@ -234,7 +234,7 @@ def test_full_disk(tmp_path):
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
 
-    done = command(
+    done = fresh_command(
         "source=torus", "style=bubble", *SMOKE, "hydra.run.dir=run", cwd=tmp_path, preexec_fn=limit
     )
     assert "hydra.run.dir" in complaint(done)
@@ -364,10 +364,15 @@ def with_seam(mesh, path):
 
 def test_a_closed_pipe_is_an_interruption_that_can_be_resumed(tmp_path):
     arguments = ["source=torus", "style=bubble", *SMOKE, "optim.steps=20", "hydra.run.dir=run"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "styleexp", *arguments],
-        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+    process = warm.start(
+        "-m",
+        "styleexp",
+        *arguments,
+        cwd=tmp_path,
+        env=warm.coarse(),
+        stdout=warm.PIPE,
+        stderr=warm.PIPE,
+    )
     assert process.stdout is not None
     process.stdout.readline()
     process.stdout.close()
@@ -431,7 +436,7 @@ def test_help_may_be_cut_off(tmp_path):
 
 
 def test_an_ascii_terminal_gets_its_sentence(tmp_path):
-    done = command(
+    done = fresh_command(
         "李.obj", "bubble", cwd=tmp_path, env={**os.environ, "PYTHONIOENCODING": "ascii"}
     )
     assert "\\u674e.obj" in complaint(done)

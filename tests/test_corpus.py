@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import warm
 from corpus import CASES, REFUSED, REPAIRED, obj
 from trying import OVERRIDES, check
 
@@ -40,10 +40,9 @@ def test_through_the_command(name, tmp_path):
     given = ["source.path=ball.obj", f"style.path='{path}'"]
     if not case.style:
         given = [f"source.path='{path}'", "style.path=ball.obj"]
-    done = subprocess.run(
-        [sys.executable, "-m", "styleexp", *given, *OVERRIDES, "report=false",
-         "preview.turntable_frames=1", "hydra.run.dir=run"],
-        cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False,
+    done = warm.run(
+        "-m", "styleexp", *given, *OVERRIDES, "report=false", "preview.turntable_frames=1",
+        "hydra.run.dir=run", cwd=tmp_path,
     )  # fmt: skip
     assert "Traceback" not in done.stderr
     left = {file.name for file in (tmp_path / "run").iterdir()}

@@ -5,11 +5,10 @@ import importlib.util
 import pkgutil
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+import warm
 
 ROOT = Path(__file__).parent.parent
 SMALL = ("profile=smoke", "metrics.judge=none", "preview.resolution=48",
@@ -59,10 +58,7 @@ def test_the_tutorials_commands_run(tmp_path):
             arguments += [*SMALL, *(LEARNED if "method=robust" in arguments else BY_SYNTHESIS)]
         if name == "styleexp-metrics":
             arguments += ["--judge", "none"]
-        done = subprocess.run(
-            [sys.executable, "-m", module, *arguments], cwd=tmp_path,
-            capture_output=True, text=True, timeout=600, check=False,
-        )  # fmt: skip
+        done = warm.run("-m", module, *arguments, cwd=tmp_path, env=warm.coarse())
         assert done.returncode == 0, (name, arguments, done.stderr)
     assert {path.name for path in (tmp_path / "outputs").iterdir()} == {"first", "two", "learned"}
     for told in ("first/report.html", "learned/result.glb", "two/table.csv", "two/figure.png",

@@ -3,11 +3,10 @@
 import csv
 import json
 import os
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+import warm
 
 from styleexp import identity, locks
 from styleexp.reports import folders, runs
@@ -37,10 +36,7 @@ main()
 
 
 def styleexp(*arguments, cwd):
-    return subprocess.run(
-        [sys.executable, "-c", STOPPED, *map(str, arguments)],
-        cwd=cwd, capture_output=True, text=True, timeout=300, check=False,
-    )  # fmt: skip
+    return warm.run("-c", STOPPED, *arguments, cwd=cwd, env=warm.coarse())
 
 
 def at_once(*commands, cwd):
@@ -289,10 +285,9 @@ def test_a_plan_refuses_another_run_in_a_jobs_folder(swept, tmp_path):
 
     ((job,),) = plan.jobs(plan.read(tmp_path / "plan.yaml"), tmp_path / "out").values()
     shutil.copytree(swept[0] / "all" / "1", job.folder)
-    done = subprocess.run(
-        [sys.executable, "-m", main.__module__, "plan.yaml", "--folder", "out"],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    done = warm.run(
+        "-m", main.__module__, "plan.yaml", "--folder", "out", cwd=tmp_path, env=warm.coarse()
+    )
     told = complaint(done)
     assert job.name in told
     assert "is not this plan's" in told

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import asdict
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+import warm
 from PIL import Image
 
 import styleexp
@@ -195,9 +194,9 @@ def test_a_masks_picture_is_a_file_of_the_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     mask = "style.mask=not:texture:a picture, really.png"
     words = ["sphere", "bubble", *MAP, "hydra.run.dir=out", mask]
-    asked = subprocess.run([sys.executable, "-m", "styleexp", *words], capture_output=True)
+    asked = warm.run("-m", "styleexp", *words)
     assert asked.returncode != 0
-    assert b"the mask 'a picture, really.png' does not exist" in asked.stderr
+    assert "the mask 'a picture, really.png' does not exist" in asked.stderr
     assert not (tmp_path / "out").exists()
 
     picture = tmp_path / "a picture, really.png"

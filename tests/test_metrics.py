@@ -295,14 +295,17 @@ def test_of_a_board_the_nearest_style_of_the_same_kind_is_named():
 
 @pytest.fixture(scope="module")
 def board(tmp_path_factory):
-    """Two finished runs and one that failed."""
+    """Two finished runs of coarse meshes, and one that failed."""
     from styleexp.cli.run import run
 
     folder = tmp_path_factory.mktemp("board")
+    for name, detail in (("torus", 2000), ("bubble", 5000), ("stripe", 5000)):
+        mesh = shapes.make(name, detail)
+        meshes.save_mesh(mesh, mesh.vertices, folder / f"{name}.ply")
     for name in ("bubble", "stripe"):
         overrides = [
-            "source=torus",
-            f"style={name}",
+            f"source.path={folder / 'torus.ply'}",
+            f"style.path={folder / name}.ply",
             "method=robust",
             "profile=smoke",
             "encoder=vgg19_random",

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
-import os
 import subprocess
-import sys
 from dataclasses import replace
 from functools import cache
 
 import pytest
 import torch
+import warm
 from torch import Tensor
 
 from styleexp import testing
@@ -186,14 +185,9 @@ def _command(folder, *arguments: str, **environment: str) -> subprocess.Complete
         "profile=smoke",
         "encoder=vgg19_random",
     ]
-    return subprocess.run(
-        [sys.executable, "-m", "styleexp", "renderer=mitsuba_ad", *smoke, *arguments],
-        cwd=folder,
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
+    environment = warm.coarse(**environment)
+    return warm.run(
+        "-m", "styleexp", "renderer=mitsuba_ad", *smoke, *arguments, cwd=folder, env=environment
     )
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import subprocess
 import sys
 import threading
 
 import pytest
 import torch
+import warm
 from conftest import available
 from torch import Tensor
 
@@ -233,14 +233,9 @@ except UserError as error:
 
 
 def command(*arguments, cwd, **environment):
-    return subprocess.run(
-        [sys.executable, "-m", "styleexp", *arguments, *SMOKE, "hydra.run.dir=run"],
-        cwd=cwd,
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
+    environment = warm.coarse(**environment)
+    return warm.run(
+        "-m", "styleexp", *arguments, *SMOKE, "hydra.run.dir=run", cwd=cwd, env=environment
     )
 
 

@@ -5,11 +5,10 @@ import os
 import shlex
 import shutil
 import signal
-import subprocess
-import sys
 import time
 
 import pytest
+import warm
 
 from styleexp import identity, meshes, origins, shapes
 from styleexp.errors import UserError
@@ -18,11 +17,8 @@ SMOKE = ["method=robust", "profile=smoke", "encoder=vgg19_random", "report=false
          "preview.resolution=32", "preview.turntable_frames=1"]  # fmt: skip
 
 
-def run(module, *arguments, cwd, **more):
-    return subprocess.run(
-        [sys.executable, "-m", module, *map(str, arguments)],
-        cwd=cwd, capture_output=True, text=True, timeout=300, check=False, **more,
-    )  # fmt: skip
+def run(module, *arguments, cwd):
+    return warm.run("-m", module, *arguments, cwd=cwd, env=warm.coarse())
 
 
 def complaint(done):
@@ -48,10 +44,9 @@ def interrupted(tmp_path_factory):
     """A folder with t.ply and a run of it that a closed terminal ended: the command it printed."""
     home = tmp_path_factory.mktemp("home dir")
     save("torus", home / "t.ply")
-    process = subprocess.Popen(
-        [sys.executable, "-m", "styleexp", "source.path=t.ply", "style=bubble", *SMOKE,
-         "optim.steps=400", "hydra.run.dir=run"],
-        cwd=home, stdout=subprocess.PIPE, text=True,
+    process = warm.start(
+        "-m", "styleexp", "source.path=t.ply", "style=bubble", *SMOKE, "optim.steps=400",
+        "hydra.run.dir=run", cwd=home, env=warm.coarse(), stdout=warm.PIPE,
     )  # fmt: skip
     lines = home / "run" / "metrics.jsonl"
     until = time.monotonic() + 240

@@ -5,11 +5,10 @@ from __future__ import annotations
 import csv
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+import warm
 from corpus import obj
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
@@ -42,11 +41,8 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-def command(*given, cwd, **more):
-    return subprocess.run(
-        [sys.executable, "-m", "styleexp", *given],
-        cwd=cwd, capture_output=True, text=True, timeout=300, check=False, **more,
-    )  # fmt: skip
+def command(*given, cwd, **variables):
+    return warm.run("-m", "styleexp", *given, cwd=cwd, env=warm.coarse(**variables))
 
 
 @pytest.mark.parametrize("name", NAMES, ids=ascii)
@@ -107,7 +103,7 @@ def test_odd_names_run_in_a_sweep_with_workers_and_keep_their_own_results(here):
     done = command(
         "-m", "source.path=" + ",".join(HARDEST), "style=bubble", *CHEAP,
         "launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweep.dir=out (1)", cwd=here,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        OMP_NUM_THREADS="1",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     records = [json.loads(p.read_text()) for p in sorted((here / "out (1)").glob("*/run.json"))]
@@ -125,12 +121,9 @@ def test_odd_names_run_in_a_plan(here):
     }
     (here / "plan.yaml").write_text(json.dumps(plan))
     code = "import sys; from styleexp.cli.sweep import main; sys.exit(main())"
-    sweep = [sys.executable, "-c", code]
-    done = subprocess.run(
-        [*sweep, "plan.yaml"], cwd=here, capture_output=True, text=True, check=False
-    )
+    done = warm.run("-c", code, "plan.yaml", cwd=here, env=warm.coarse())
     assert done.returncode == 0, done.stderr + done.stdout
-    subprocess.run([*sweep, "collect", "outputs/plan"], cwd=here, check=True, capture_output=True)
+    assert warm.run("-c", code, "collect", "outputs/plan", cwd=here).returncode == 0
     with open(here / "outputs/plan/runs.csv", newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == len(chosen)

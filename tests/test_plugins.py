@@ -9,6 +9,7 @@ import textwrap
 from pathlib import Path
 
 import pytest
+import warm
 
 ROOT = Path(__file__).parent.parent
 SMOKE = ["source=torus", "method=robust", "profile=smoke", "hydra.run.dir=run"]
@@ -171,18 +172,22 @@ def installed(tmp_path_factory):
     return folder
 
 
+def environment(path, variables):
+    found = {**os.environ, **variables}
+    return found if path is None else {**found, "PYTHONPATH": str(path)}
+
+
 def process(*command, cwd, path=None, **variables):
-    environment = {**os.environ, **variables}
-    if path is not None:
-        environment["PYTHONPATH"] = str(path)
+    """Any program, started anew."""
     return subprocess.run(
-        [str(part) for part in command],
-        cwd=cwd, env=environment, capture_output=True, text=True, timeout=300, check=False,
+        [str(part) for part in command], cwd=cwd, env=environment(path, variables),
+        capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
 
 
-def styleexp(*arguments, **how):
-    return process(sys.executable, "-m", "styleexp", *arguments, **how)
+def styleexp(*arguments, cwd, path=None, **variables):
+    env = warm.coarse(**environment(path, variables))
+    return warm.run("-m", "styleexp", *arguments, cwd=cwd, env=env)
 
 
 @pytest.fixture(scope="module")

@@ -2,12 +2,11 @@
 
 import json
 import random
-import subprocess
-import sys
 import time
 
 import numpy as np
 import pytest
+import warm
 from browser import browser, check_quiet, covered, pixels, wait
 
 EVIL = "<img src=x onerror=alert(1)>"
@@ -16,17 +15,11 @@ PARTICIPANTS = 20
 
 
 def styleexp(*arguments, cwd):
-    return subprocess.run(
-        [sys.executable, "-m", "styleexp", *map(str, arguments)],
-        cwd=cwd, capture_output=True, text=True, timeout=300, check=False,
-    )  # fmt: skip
+    return warm.run("-m", "styleexp", *arguments, cwd=cwd, env=warm.coarse())
 
 
 def report(*arguments, cwd):
-    done = subprocess.run(
-        [sys.executable, "-m", "styleexp.cli.report", *map(str, arguments)],
-        cwd=cwd, capture_output=True, text=True, timeout=300, check=False,
-    )  # fmt: skip
+    done = warm.run("-m", "styleexp.cli.report", *arguments, cwd=cwd)
     assert done.returncode == 0, done.stderr
     return done
 
@@ -37,7 +30,7 @@ def runs(tmp_path_factory):
     from styleexp import meshes, shapes
 
     folder = tmp_path_factory.mktemp("runs")
-    torus = shapes.make("torus")
+    torus = shapes.make("torus", detail=2000)
     meshes.save_mesh(torus, torus.vertices, folder / f"{EVIL}.obj")
     done = styleexp(
         f'source.path="{EVIL}.obj"', "style=bubble", *SMOKE, "hydra.run.dir=evil", cwd=folder

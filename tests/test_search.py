@@ -1,20 +1,15 @@
 """``+search=optuna``: real trials."""
 
-import subprocess
-import sys
-
 import pytest
+import warm
 
 pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="needs the extra search")
 
 
 def search(cwd, *more):
-    return subprocess.run(
-        [
-            sys.executable, "-m", "styleexp", "+search=optuna", "source=torus", "style=bubble",
-            "profile=smoke", "encoder=vgg19_random", "hydra.sweep.dir=all", *more,
-        ],
-        cwd=cwd, capture_output=True, text=True, check=False,
+    return warm.run(
+        "-m", "styleexp", "+search=optuna", "source=torus", "style=bubble", "profile=smoke",
+        "encoder=vgg19_random", "hydra.sweep.dir=all", *more, cwd=cwd, env=warm.coarse(),
     )  # fmt: skip
 
 

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import warm
 from trying import one_encoder
 
 from styleexp import compose, targets
@@ -82,11 +83,9 @@ def test_a_configuration_file_can_not_run_code(kind, tmp_path):
     (tmp_path / "conf" / "experiment").mkdir(parents=True)
     head = "# @package _global_\n"
     (tmp_path / "conf" / "experiment" / "evil.yaml").write_text(head + EVIL[kind])
-    done = subprocess.run(
-        [sys.executable, "-m", "styleexp", "--config-dir", "conf", "+experiment=evil",
-         "source=torus", "style=bubble"],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+    done = warm.run(
+        "-m", "styleexp", "--config-dir", "conf", "+experiment=evil", "source=torus",
+        "style=bubble", cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(tmp_path)},
     )  # fmt: skip
     assert done.returncode == 2, done.stderr
     assert "victim.run" in done.stderr

@@ -176,7 +176,7 @@ def save_torus(path, scale, shift):
     return path
 
 
-def test_optimisation_reaches_for_the_style():
+def test_optimisation_reaches_for_the_style(coarse_shapes):
     """With enough steps on a small scene, the distance to the style falls by half."""
     _, steps = run("source=sphere", "style=wave_large", "optim.steps=60", "field.start=source")
     first, last = [np.mean([s.loss for s in part]) for part in (steps[:3], steps[-3:])]

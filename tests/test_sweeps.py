@@ -11,6 +11,7 @@ import time
 from contextlib import suppress
 
 import pytest
+import warm
 
 from styleexp import locks
 from styleexp.errors import UserError
@@ -39,15 +40,11 @@ JOBS = 4
 """Of that plan: one of the five is another's."""
 
 
-def command(*arguments):
-    return [sys.executable, "-m", "styleexp.cli.sweep", *map(str, arguments)]
+SWEEP = ("-m", "styleexp.cli.sweep")
 
 
 def sweep(*arguments, cwd, **environment):
-    return subprocess.run(
-        command(*arguments), cwd=cwd, env={**os.environ, **environment},
-        capture_output=True, text=True, timeout=600, check=False,
-    )  # fmt: skip
+    return warm.run(*SWEEP, *arguments, cwd=cwd, env=warm.coarse(**environment))
 
 
 def results(folder):
@@ -158,7 +155,7 @@ def test_dry_run_prints_the_very_commands_and_runs_nothing(undisturbed, tmp_path
     assert len(commands) == JOBS + 1
     assert "# the same job as above" in commands[-1]
     words = shlex.split(commands[0], comments=True)
-    run = subprocess.run([sys.executable, "-m", *words], cwd=tmp_path, capture_output=True)
+    run = warm.run("-m", *words, cwd=tmp_path, env=warm.coarse())
     assert run.returncode == 0
     ((name, mesh),) = results(tmp_path / "out").items()
     assert results(undisturbed[0])[name] == mesh
@@ -234,10 +231,9 @@ def test_a_failed_job_stays_failed_until_it_is_retried(tmp_path):
 
 def test_a_run_refuses_a_folder_that_another_process_is_at(tmp_path):
     with locks.hold(tmp_path / "run"):
-        done = subprocess.run(
-            [sys.executable, "-m", "styleexp", "source=torus", "style=rail", "hydra.run.dir=run"],
-            cwd=tmp_path, capture_output=True, text=True, check=False,
-        )  # fmt: skip
+        done = warm.run(
+            "-m", "styleexp", "source=torus", "style=rail", "hydra.run.dir=run", cwd=tmp_path
+        )
     assert done.returncode == 2
     assert "another process is at work in" in done.stderr
     assert not (tmp_path / "run" / "run.json").exists()
@@ -246,10 +242,11 @@ def test_a_run_refuses_a_folder_that_another_process_is_at(tmp_path):
 def test_two_runners_share_a_plan_and_do_no_job_twice(undisturbed, tmp_path):
     path = write_plan(tmp_path)
     runners = [
-        subprocess.Popen(command(path, "--folder", "out"), cwd=tmp_path, text=True,
-                         stdout=subprocess.PIPE)
+        warm.start(
+            *SWEEP, path, "--folder", "out", cwd=tmp_path, env=warm.coarse(), stdout=warm.PIPE
+        )
         for _ in range(2)
-    ]  # fmt: skip
+    ]
     told = [runner.communicate(timeout=600)[0] for runner in runners]
     assert [runner.returncode for runner in runners] == [0, 0]
     assert results(tmp_path / "out") == results(undisturbed[0])
@@ -267,8 +264,8 @@ class Victims:
 
     def start(self):
         with open(self.cwd / "told.txt", "a") as told:
-            runner = subprocess.Popen(
-                command(*self.arguments), cwd=self.cwd, stdout=told, stderr=told,
+            runner = warm.start(
+                *SWEEP, *self.arguments, cwd=self.cwd, env=warm.coarse(), stdout=told, stderr=told,
                 start_new_session=True,
             )  # fmt: skip
         self.started.append(runner)
@@ -304,7 +301,7 @@ def test_kill_9_of_runners_and_workers_loses_nothing(launcher, undisturbed, tmp_
         runner = victims.start()
         deadline = time.monotonic() + 120 + 60 * KILLS
         while len(killed) < KILLS and runner.poll() is None:
-            moment = time.monotonic() + chance.uniform(0, 4)
+            moment = time.monotonic() + chance.uniform(0, 2)
             while not running(out) or time.monotonic() < moment:
                 assert time.monotonic() < deadline, (tmp_path / "told.txt").read_text()
                 if runner.poll() is not None:
@@ -438,10 +435,9 @@ def test_jobs_given_in_batches_are_all_done(undisturbed, tmp_path):
         "import sys; from styleexp.cli.sweep import main; from styleexp.sweeps import launchers; "
     )
     code += "launchers.MANY = 3; sys.exit(main(sys.argv[1:]))"
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(write_plan(tmp_path)), "--folder", "out"], cwd=tmp_path,
-        capture_output=True, text=True, timeout=600, check=False,
-    )  # fmt: skip
+    done = warm.run(
+        "-c", code, write_plan(tmp_path), "--folder", "out", cwd=tmp_path, env=warm.coarse()
+    )
     assert done.returncode == 0, done.stderr
     assert "(4 of 4 done)" in done.stdout
     assert results(tmp_path / "out") == results(undisturbed[0])

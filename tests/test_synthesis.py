@@ -261,7 +261,7 @@ def test_what_can_not_be_laid_is_said_in_one_sentence(style, options, told):
         styleexp.stylize("torus", style, *CHEAP, *options)
 
 
-def test_learning_can_start_at_the_synthesis():
+def test_learning_can_start_at_the_synthesis(coarse_shapes):
     """Before the first step it is what ``method=synthesis`` makes."""
     made = styleexp.stylize("torus", "stripe", "source.refine=none", "field.unfold=false")
     config = compose(["method=robust", "source=torus", "style=stripe", "field.start=synthesis"])

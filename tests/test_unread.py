@@ -1,12 +1,10 @@
 """Options that change nothing: each method's declaration is what it reads, and the user is told."""
 
-import os
-import subprocess
-import sys
 from dataclasses import is_dataclass
 
 import numpy as np
 import pytest
+import warm
 from PIL import Image
 
 import styleexp
@@ -149,10 +147,9 @@ def test_the_command_says_so_once_and_nothing_of_what_an_experiment_chose(small,
            "preview.resolution=48", "preview.turntable_frames=2")  # fmt: skip
 
     def lines(*arguments):
-        done = subprocess.run(
-            [sys.executable, "-m", "styleexp", "--config-dir", "conf", "+experiment=two", *small,
-             *few, *arguments],
-            cwd=tmp_path, env=os.environ, capture_output=True, text=True, check=False,
+        done = warm.run(
+            "-m", "styleexp", "--config-dir", "conf", "+experiment=two", *small, *few, *arguments,
+            cwd=tmp_path, env=warm.coarse(),
         )  # fmt: skip
         assert done.returncode == 0, done.stderr
         return [line for line in done.stdout.splitlines() if "effect" in line]
