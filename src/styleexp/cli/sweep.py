@@ -47,8 +47,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("plan", type=Path, metavar="PLAN", help="a plan file, see sweeps/")
     parser.add_argument(
-        "overrides", nargs="*", metavar="KEY=VALUE", help="overrides for every job, e.g. profile=standard; "
-        "those that begin with hydra. configure the launcher, e.g. hydra.launcher.partition=gpu",
+        "overrides", nargs="*", metavar="KEY=VALUE", help="overrides for every job, "
+        "e.g. profile=standard; those that begin with hydra. configure the launcher, "
+        "e.g. hydra.launcher.partition=gpu",
     )  # fmt: skip
     parser.add_argument("--folder", type=Path, help="default: outputs/ and the plan's name")
     parser.add_argument("--launcher", metavar="NAME", help="basic, joblib, submitit_local, "
