@@ -1,22 +1,22 @@
-# make demo   set up .venv, stylise a mesh on the CPU, say where the result is
+# make demo   set up .venv, stylise a mesh on the CPU, print where the result is
 # make test   set up .venv, run every test
 # make test-quick   the tests of geometry, files, losses and fields alone, which run no command: under
 #             two minutes on two cores
 # make lint   ruff and mypy
 # make docs   the documentation, to site/index.html; warnings are errors
 # make conformance   write docs/conformance.md from the checks of every renderer
-# make stress   all that takes long: kill runners and workers of sweeps ten times each, with every
+# make stress   all slow tests: kill runners and workers of sweeps ten times each, with every
 #               local launcher; start two sweeps at once twenty times each way; random meshes,
 #               files, overrides and renders, STRESS_FUZZ times as many as in CI; every fault of
 #               benchmarks/faults.py; benchmarks/long_haul.py. Each of the last three gets
 #               STRESS_SECONDS. (make stress-sweeps stress-folders stress-fuzz stress-faults
 #               stress-long: one of them)
 # make matrix   install and run as wheel, editable, with the oldest and the newest dependencies, on
-#               every Python that is here (noxfile.py)
-# make sbom   what .venv holds, as CycloneDX, in build/sbom.json (tools in .venv-security)
-# make audit  known weaknesses of what .venv holds (asks pypi.org)
-# make bench-guard   is this tree slower than a commit (BASE=...), at the same moment on this machine?
-# make ray-test   a sweep on a local Ray cluster, in an environment of its own (.venv-ray)
+#               every available Python (noxfile.py)
+# make sbom   the contents of .venv, as CycloneDX, in build/sbom.json (tools in .venv-security)
+# make audit  known vulnerabilities in .venv (queries pypi.org)
+# make bench-guard   compare the speed of this tree with a commit (BASE=...), interleaved on this machine
+# make ray-test   a sweep on a local Ray cluster, in a separate environment (.venv-ray)
 # Override: PYTHON (which interpreter), CONSTRAINTS (pinned versions; empty for none), PIP_FLAGS.
 
 PYTHON ?= python3
@@ -26,17 +26,17 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check \
 	$(if $(CONSTRAINTS),--constraint $(CONSTRAINTS)) $(PIP_FLAGS)
 
-# How many times as many random examples as in CI, and how many seconds each long part may take.
+# Factor on CI's number of random examples, and time limit in seconds for each long part.
 STRESS_FUZZ ?= 50
 STRESS_SECONDS ?= 3600
 
-# Whose tests test functions, in the tests' own process.
+# Tests of functions, in the tests' own process.
 QUICK := collect fields gltf height_maps losses ply_obj refining relief remembered shapes views \
 	welding
 
-# Two busy cores and spinning OpenMP threads make everything many times slower.
+# On busy cores, spinning OpenMP threads make everything many times slower.
 export OMP_WAIT_POLICY ?= PASSIVE
-# Named meshes and images, where there are some beside the checkout.
+# Named meshes and images, if there are any next to the checkout.
 export STYLEEXP_ASSETS ?= $(wildcard $(abspath ../shared))
 
 .PHONY: demo test test-quick lint docs conformance stress stress-sweeps stress-folders stress-fuzz stress-faults \

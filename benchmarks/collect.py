@@ -1,4 +1,4 @@
-"""How long collecting a thousand run folders takes: python benchmarks/collect.py"""
+"""Time the collection of a thousand run folders: python benchmarks/collect.py"""
 
 import json
 import tempfile

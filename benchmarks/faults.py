@@ -1,4 +1,4 @@
-"""Befall runs, sweeps, caches and downloads with faults, and write their table in
+"""Inject faults into runs, sweeps, caches and downloads, and write their table in
 docs/robustness.md.
 
     python benchmarks/faults.py                     # all, half an hour on one idle core
@@ -6,9 +6,9 @@ docs/robustness.md.
     python benchmarks/faults.py --times 2 --seed 7  # fewer trials, other moments
     python benchmarks/faults.py --seconds 600       # begin no trial after so long
 
-A fault that lost something ends the command with exit code 1. The table's rows are replaced one by
-one: what was not tried stays as it was. Full disks and frozen folders are real ones and need root;
-clocks that jump need Debian's package faketime; what can't be tried is named.
+Exits with code 1 if a fault lost data. Only rows of tested faults are replaced in the table. Full
+disks and frozen folders are real and need root; clock jumps need Debian's package faketime;
+untestable faults are listed.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ HEAD = "| fault | tried | survived | lost | what the user sees |\n" + "| --- " *
 
 
 def main() -> int:
-    """Try the faults, write the table."""
+    """Inject the faults and write the table."""
     from fault_trials import FAULTS, Missing, Stage
 
     parser = argparse.ArgumentParser(description=__doc__)
@@ -77,7 +77,7 @@ def main() -> int:
 
 
 def page(text: str, rows: dict[str, str]) -> str:
-    """The page with these rows brought up to date."""
+    """The page with these rows updated."""
     from fault_trials import FAULTS
 
     start, end = text.index(BEGIN) + len(BEGIN), text.index(END)

@@ -1,4 +1,4 @@
-"""Draw docs/benchmarks.md's figures from the JSON of `styleexp-bench`.
+"""Draw the figures of docs/benchmarks.md from the JSON of `styleexp-bench`.
 
 python benchmarks/figures.py ROWS.json... OUT.png
 
@@ -19,12 +19,13 @@ STEP_PARTS = ("encoder", "Gram matrices", "loss", "render", "field")
 
 
 def with_backward(parts: dict[str, float], name: str) -> float:
-    """What a part takes in both directions."""
+    """Time of a part, forward plus backward."""
     return parts.get(name, 0) + parts.get(f"{name} backward", 0)
 
 
 def draw_renders(rows: list[dict]) -> None:
-    """A panel for each of faces, resolution and views that varies; the others as usual."""
+    """One panel per varying parameter (faces, resolution, views), with the others at their
+    defaults."""
     axes_of = ("faces", "resolution", "views")
     varied = [key for key in axes_of if len({row[key] for row in rows}) > 1]
     _, axes = pyplot.subplots(
@@ -47,7 +48,7 @@ def draw_renders(rows: list[dict]) -> None:
 
 
 def draw_layers(rows: list[dict]) -> None:
-    """A bar of parts for each row, the cheapest first."""
+    """One stacked bar of parts per row, cheapest first."""
     rows = sorted(rows, key=lambda row: row["step_cpu_ms"])
     _, axis = pyplot.subplots(figsize=(7.2, 0.9 + 0.42 * len(rows)), layout="constrained")
     names = [", ".join(layer.removeprefix("conv") for layer in row["layers"]) for row in rows]
@@ -63,7 +64,7 @@ def draw_layers(rows: list[dict]) -> None:
 
 
 def main(names: list[str], out: str) -> None:
-    """Read all rows and draw what they are."""
+    """Read all rows and draw the matching figure."""
     rows = []
     for name in names:
         with open(name) as file:

@@ -1,10 +1,10 @@
-"""Has the working tree become slower than a baseline commit? ``make bench-guard BASE=<commit>``
+"""Check the working tree for slowdowns against a commit: ``make bench-guard BASE=<commit>``
 
-The same few pieces of work are timed in both trees, each in a process of its own, in turns, by CPU
-time at one thread. What counts is the ratio of the least times: neighbours on the machine can only
-add to a time. Prints a table; exits with 1 where a ratio is above the limit, 2 for a mistake.
+The same tasks are timed in both trees, in separate interleaved processes, by CPU time with one
+thread. The ratio of the minimum times counts, because other processes can only increase a time.
+Prints a table; exits with 1 if a ratio exceeds the limit, and with 2 for a user error.
 
-Only what both trees have can be compared: a piece that either lacks is skipped by name.
+Tasks that one of the trees lacks are listed and skipped.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 STORED = Path(__file__).with_name("baseline")
-"""Holds the commit to compare with where none is given."""
+"""File with the default commit to compare with."""
 
 FROM = """
 import sys
@@ -126,7 +126,7 @@ WORK = {
 
 
 def main() -> int:
-    """Compare, print, judge."""
+    """Compare, print, and return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("base", nargs="?", default=STORED.read_text().strip(), help="commit")
     parser.add_argument("--limit", type=float, default=1.15, help="ratio that fails (1.15)")
@@ -151,7 +151,7 @@ def main() -> int:
 
 
 def compare(base: Path, work: dict[str, str], options: argparse.Namespace) -> int:
-    """Time both trees in turns; 1 if one piece is slower than the limit allows."""
+    """Time both trees in turns; return 1 if any task is slower than the limit allows."""
     print(f"CPU ms at one thread, least of {options.rounds} processes each")
     print(f"{'':22s} {options.base[:10]:>10s} {'here':>10s} {'ratio':>7s}")
     failed = []
@@ -173,7 +173,7 @@ def compare(base: Path, work: dict[str, str], options: argparse.Namespace) -> in
 
 
 def timed(tree: Path, code: str) -> list[float]:
-    """Seconds that the work takes in a tree; nothing where it can't run there."""
+    """Seconds of a task in a tree; None if it can't run there."""
     given = os.environ | {
         "OMP_NUM_THREADS": "1",
         "OMP_WAIT_POLICY": "PASSIVE",

@@ -1,5 +1,5 @@
-"""Many steps in a run, many runs in one process, and a sweep of many jobs: does anything grow, leak
-or get lost?
+"""Soak test: many steps in a run, many runs in one process, and a sweep of many jobs. Checks for
+growth, leaks and losses.
 
     python benchmarks/long_haul.py                          # 500 steps, 500 runs, 2000 jobs
     python benchmarks/long_haul.py --runs 100 --jobs 0 --steps 0    # only the runs, fewer
@@ -43,24 +43,24 @@ SMALL = (
     "preview.resolution=32", "preview.turntable_frames=2", "report=false",
 )  # fmt: skip
 WARM_UP = 0.2
-"""Share of the runs that are not part of the slope: caches fill, allocators settle."""
+"""Warm-up fraction excluded from the slope, while caches fill and allocators settle."""
 PAGE_SIZE = os.sysconf("SC_PAGE_SIZE")
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What a process, or several, hold at a moment."""
+    """Resources held by one or several processes at one time."""
 
     at: float
-    """Steps, runs or jobs done."""
+    """Number of steps, runs or jobs done."""
     memory: float
-    """Resident, in MB."""
+    """Resident memory in MB."""
     files: int
     threads: int
     contexts: int = 0
     temporary: int = 0
     used: float = float("nan")
-    """MB that the C library has given out and not got back; resident are its holes, too."""
+    """MB allocated by the C library and not freed; resident memory also includes its holes."""
 
 
 def of_process(pid: int) -> tuple[float, int, int]:
@@ -81,7 +81,8 @@ class _Arenas(ctypes.Structure):
 
 
 def given_out() -> float:
-    """MB that this process has from the C library; NaN where that is not glibc 2.33 or newer."""
+    """MB that this process has allocated from the C library; NaN unless it is glibc 2.33 or
+    newer."""
     tell = getattr(ctypes.CDLL(None), "mallinfo2", None)
     if tell is None:
         return float("nan")
@@ -91,7 +92,7 @@ def given_out() -> float:
 
 
 def contexts() -> int:
-    """OpenGL contexts of this process that were not freed."""
+    """Number of unfreed OpenGL contexts in this process."""
     if "moderngl" not in sys.modules:
         return 0
     kind: Any = sys.modules["moderngl"].Context
@@ -125,7 +126,7 @@ def prepare(folder: Path) -> None:
 
 
 def many_steps(count: int, until: float, every: int = 5) -> list[Sample]:
-    """Take so many steps of a run with the sizes of ``profile=fast``."""
+    """Run this many steps with the sizes of ``profile=fast``."""
     from styleexp import baselines
     from styleexp.compose import compose
 
@@ -153,7 +154,7 @@ def many_steps(count: int, until: float, every: int = 5) -> list[Sample]:
 
 
 def renderers() -> list[str]:
-    """Those that can be used here."""
+    """Renderers that are usable here."""
     from styleexp import plugins
     from styleexp.errors import UserError
 
@@ -166,7 +167,7 @@ def renderers() -> list[str]:
 
 
 def variants(folder: Path) -> Iterator[list[str]]:
-    """Runs that differ, for ever: a turn of sixty has every combination."""
+    """Endless sequence of different runs; a cycle of sixty covers every combination."""
     usable, number = renderers(), 0
     while True:
         source = ("ball", "ring")[number % 2]
@@ -181,7 +182,7 @@ def variants(folder: Path) -> Iterator[list[str]]:
 
 
 def many_runs(count: int, folder: Path, until: float, every: int = 5) -> list[Sample]:
-    """Run so many in this process, if there is time, and look at it every few runs."""
+    """Run this many in this process, time permitting, sampling resources every few runs."""
     from styleexp.cli.run import run
     from styleexp.compose import compose
 
@@ -283,7 +284,7 @@ def many_jobs(
 
 
 def row(name: str, unit: str, samples: list[Sample]) -> str:
-    """A process's line in the table."""
+    """A process's row in the table."""
     first, last = samples[int(WARM_UP * len(samples))], samples[-1]
     cells = [
         name, f"{len(samples)}", f"{first.memory:.0f} → {last.memory:.0f}",
@@ -302,7 +303,7 @@ HEAD = (
 
 
 def write(kind: str, text: str) -> None:
-    """Put a section into the page."""
+    """Insert a section into the page."""
     begin, end = MARKS[kind]
     page = PAGE.read_text(encoding="utf-8")
     start = page.index(begin) + len(begin)
@@ -311,7 +312,7 @@ def write(kind: str, text: str) -> None:
 
 
 def main() -> int:
-    """Run both, write what was found."""
+    """Run all tests and write the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=500)
     parser.add_argument("--runs", type=int, default=500)

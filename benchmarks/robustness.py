@@ -1,10 +1,10 @@
-"""Try every file of the corpus and write docs/robustness.md.
+"""Test every file of the corpus and write docs/robustness.md.
 
     python benchmarks/robustness.py           # tries all, writes the page, says how long it took
     python benchmarks/robustness.py --table   # the page alone, from what is expected
 
-The page lists what is expected of each file; a file that comes out otherwise ends the command with
-exit code 1 and leaves the page as it was. tests/test_corpus.py tries the same files in CI.
+The page lists the expected outcome of each file. If any file has another outcome, the command exits
+with code 1 and leaves the page unchanged. tests/test_corpus.py tests the same files in CI.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ OUTCOMES = {WORKS: "works", REPAIRED: "repaired", REFUSED: "refused"}
 
 
 def table() -> str:
-    """The counts by group, then every file."""
+    """Counts by group, then every file."""
     groups = list(dict.fromkeys(case.group for case in CASES.values()))
     out = ["| files | tried | works | works, repair named | refused |", "| --- " * 5 + "|"]
     for group in [*groups, None]:
@@ -59,12 +59,12 @@ def _escaped(text: str) -> str:
 
 
 def page(text: str) -> str:
-    """The page with its table brought up to date."""
+    """The page with its table updated."""
     return text[: text.index(MARK) + len(MARK)] + "\n" + table()
 
 
 def main() -> int:
-    """Try the files, write the page."""
+    """Test the files and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--table", action="store_true", help="try nothing, write the page")
     wrong = 0

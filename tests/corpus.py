@@ -286,7 +286,7 @@ def _truncated() -> None:
                 f"the first {percent} %",
                 cut,
                 REPAIRED if untold else REFUSED,
-                "cut off" if untold else "",
+                "truncated" if untold else "",
             )
         said, needed = kind in ("off", "ascii.ply", "ascii.stl"), kind != "obj"
         case(
@@ -295,7 +295,7 @@ def _truncated() -> None:
             "all but its last byte",
             whole[:-1],
             WORKS if said else REFUSED if needed else REPAIRED,
-            "" if needed else "cut off",
+            "" if needed else "truncated",
         )
     document, buffer = gltf_parts()
     outside = gltf(document, buffer, "ball.bin")
@@ -504,7 +504,7 @@ def _coordinates() -> None:
         "a million times longer than wide",
         obj(V * [1e6, 1, 1]),
         REFUSED,
-        "the views see nothing of the source",
+        "the views don't see",
     )
     case(
         group,
@@ -603,10 +603,10 @@ def _topology() -> None:
         "a quarter of the faces turned",
         obj(V, turned),
         REPAIRED,
-        "turned",
+        "flipped",
         **BALL,
     )
-    case(group, "inward.obj", "inside out", obj(V, F[:, ::-1]), REPAIRED, "inside out", **BALL)
+    case(group, "inward.obj", "inside out", obj(V, F[:, ::-1]), REPAIRED, "inwards", **BALL)
     case(
         group,
         "fan.obj",
@@ -654,7 +654,7 @@ def _topology() -> None:
         "a hollow ball",
         obj(*joined(ball, (V / 2, F[:, ::-1]))),
         REPAIRED,
-        "inside out",
+        "pointed inwards",
         faces=160,
     )
     tetra = (CUBE[[0, 3, 5, 6]], np.array([(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]))
@@ -822,7 +822,7 @@ def _topology() -> None:
         "a style with a hole and turned faces",
         obj(V, turned[8:]),
         REPAIRED,
-        "turned",
+        "flipped",
         style=True,
     )
 
@@ -1480,15 +1480,15 @@ def _gltf_numbers() -> None:
     build("fewcolors", "fewer colours than vertices",
           [("COLOR_0", color[:9], 5123, True)], None, REFUSED, "9 elements")  # fmt: skip
     build("stride", "a stride shorter than its elements", (),
-          lambda d: d["bufferViews"][0].update(byteStride=4), REFUSED, "than it holds")  # fmt: skip
+          lambda d: d["bufferViews"][0].update(byteStride=4), REFUSED, "it contains")  # fmt: skip
     build("instances", "a hundred thousand nodes that show one mesh", (),
           lambda d: d.update(nodes=[{"mesh": 0}] * 100_000,
                              scenes=[{"nodes": list(range(100_000))}]),
-          REFUSED, "so often")  # fmt: skip
+          REFUSED, "too often")  # fmt: skip
     build("diamond", "nodes below two others, 2^60 ways to the mesh", (),
           lambda d: d.update(nodes=[*({"children": [k + 1, k + 1]} for k in range(60)),
                                     {"mesh": 0}]),
-          REFUSED, "below two others")  # fmt: skip
+          REFUSED, "child of two nodes")  # fmt: skip
     instancing = {"EXT_mesh_gpu_instancing": {"attributes": {}}}
     build("instancing", "instances by an extension that isn't required", (),
           lambda d: d["nodes"][0].update(extensions=instancing),
@@ -1514,7 +1514,7 @@ def _tables() -> None:
          wider(one("confidence") + one("label", kind="int"), values=b" 0.5 7"),
          REPAIRED, "vertex properties (confidence, label)", **BALL)  # fmt: skip
     case(group, "segment.ply", "faces' segment", wider(face=one("segment"), face_values=b" 3"),
-         REPAIRED, "GLB none for face properties (segment)", **BALL)  # fmt: skip
+         REPAIRED, "GLB can't store face properties (segment)", **BALL)  # fmt: skip
     case(group, "lists.ply", "a list for each vertex", wider(lists, values=b" 2 0.5 0.5"),
          REPAIRED, "weights", **BALL)  # fmt: skip
     case(group, "facecolors.ply", "faces' colours",
@@ -1531,7 +1531,7 @@ def _tables() -> None:
     strips = ply(faces=[], kind="ascii").replace(b"face 0", b"tristrips 1") + b"4 0 1 2 3\n"
     case(group, "strips.ply", "triangle strips", strips, REFUSED, "triangle strips")
     case(group, "type.ply", "a number that its type can't hold",
-         wider(one("label", kind="uchar"), values=b" 300"), REFUSED, "cannot hold")  # fmt: skip
+         wider(one("label", kind="uchar"), values=b" 300"), REFUSED, "represent")  # fmt: skip
     lines = obj().split(b"\n")
 
     def colored(weight: bytes, every: int) -> bytes:
@@ -1554,10 +1554,10 @@ def _rounding() -> None:
     soup = np.nextafter(far, way).astype(float), np.arange(len(far)).reshape(-1, 3)
     for kind, write in (("stl", stl), ("ply", ply), ("obj", obj)):
         case(group, f"noise.{kind}", "corners off by a unit in the last place of singles",
-             write(*soup), REPAIRED, "joined", **BALL)  # fmt: skip
+             write(*soup), REPAIRED, "merged", **BALL)  # fmt: skip
     digits = (V[F].reshape(-1, 3) + rng.uniform(-4e-7, 4e-7, (240, 3))).round(6)
     case(group, "digits.obj", "corners off in the last of six decimals",
-         obj(digits, soup[1]), REPAIRED, "joined", **BALL)  # fmt: skip
+         obj(digits, soup[1]), REPAIRED, "merged", **BALL)  # fmt: skip
     half = V[F].reshape(-1, 3).copy()
     half[:120] += [0, 0, 2e-5]
     case(group, "gap.obj", "two halves wider apart than rounding explains",
@@ -1662,11 +1662,11 @@ def _pictures() -> None:
     for percent in (30, 90):
         add(f"deepcut{percent}.png", f"the first {percent} % of 16-bit colours",
             lambda percent=percent: (whole := deep(color)())[: len(whole) * percent // 100],
-            REFUSED, "damaged or cut short")  # fmt: skip
+            REFUSED, "damaged or truncated")  # fmt: skip
         add(f"deepcut{percent}.tiff", f"the first {percent} % of 16-bit colours",
             lambda percent=percent: (whole := deep(color, "tiff", photometric="rgb")())
             [: len(whole) * percent // 100],
-            REFUSED, "damaged or cut short")  # fmt: skip
+            REFUSED, "damaged or truncated")  # fmt: skip
     bump = np.gradient(pixels()[..., 0] / 40.0)
     normal = np.stack([-bump[1], -bump[0], np.ones_like(bump[0])], axis=-1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -1697,8 +1697,8 @@ def _pictures() -> None:
     add("strip.png", "30000x16", picture("PNG", np.resize(pixels()[..., 0], (16, 30000))))
     add("least.png", "16x16", picture("PNG", pixels(16, 16)))
     black, clear = np.zeros((64, 64), np.uint8), np.zeros((64, 64, 4), np.uint8)
-    add("black.png", "black all over", picture("PNG", black), REFUSED, "one tone")
-    add("clear.png", "wholly transparent", picture("PNG", clear), REFUSED, "one tone")
+    add("black.png", "black all over", picture("PNG", black), REFUSED, "uniform tone")
+    add("clear.png", "wholly transparent", picture("PNG", clear), REFUSED, "uniform tone")
 
     def animated(kind: str):
         def make() -> bytes:
@@ -1711,10 +1711,10 @@ def _pictures() -> None:
 
         return make
 
-    add("moving.png", "an animated PNG", animated("PNG"), REPAIRED, "first of 2 frames")
-    add("moving.webp", "an animated WebP", animated("WEBP"), REPAIRED, "first of 2 frames")
-    add("moving.gif", "an animated GIF", animated("GIF"), REPAIRED, "first of 2 frames")
-    add("pages.tiff", "a TIFF of two pages", animated("TIFF"), REPAIRED, "first of 2 frames")
+    add("moving.png", "an animated PNG", animated("PNG"), REPAIRED, "has 2 frames")
+    add("moving.webp", "an animated WebP", animated("WEBP"), REPAIRED, "has 2 frames")
+    add("moving.gif", "an animated GIF", animated("GIF"), REPAIRED, "has 2 frames")
+    add("pages.tiff", "a TIFF of two pages", animated("TIFF"), REPAIRED, "has 2 frames")
 
     def rotated() -> bytes:
         from PIL import Image
@@ -1740,7 +1740,7 @@ def _pictures() -> None:
         "more pixels claimed than there are",
         png_claiming(500, 500),
         REFUSED,
-        "cut short",
+        "truncated",
     )
     add(
         "drawing.png",

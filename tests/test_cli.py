@@ -33,7 +33,7 @@ def complaint(done):
     """The one line on standard error of a refused command."""
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
-    beside = ("warning: ", "fetching the weights ")  # where the cache is still empty
+    beside = ("warning: ", "downloading the weights ")  # where the cache is still empty
     lines = [x for x in done.stderr.splitlines() if x.strip() and not x.startswith(beside)]
     assert len(lines) == 1, done.stderr
     return lines[0]
@@ -130,7 +130,7 @@ def test_an_interrupted_synthesis_says_how_to_run_it_again(tmp_path):
     process.send_signal(signal.SIGINT)
     _, told = process.communicate(timeout=120)
     assert process.returncode == 130
-    assert f"stopped; run it again with: styleexp resume={folder}" in told
+    assert f"stopped; rerun with: styleexp resume={folder}" in told
     assert json.loads((folder / "status.json").read_text())["status"] == "interrupted"
     assert not (folder / "result.ply").exists()
 
@@ -157,7 +157,7 @@ def test_what_another_run_left_unfinished_is_not_replaced_without_a_word(finishe
     given = ["source=torus", "style=bubble", *SMOKE, "hydra.run.dir=run", "report=false"]
     done = command(*given, "optim.steps=3", "preview.turntable_frames=1", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "had other settings, files or another version: it is replaced" in done.stdout
+    assert "which had other settings, files or another version" in done.stdout
 
 
 def test_a_refused_command_costs_no_result_that_is_there(finished, tmp_path):

@@ -100,7 +100,7 @@ def test_a_good_checkpoint_outlives_the_next_one_saved_after_a_damaged_one(tmp_p
     found = state(0)
     told = folder.load_checkpoint(found)
     assert "does not match its digest" in told
-    assert "the checkpoint before it is used" in told
+    assert "using the previous checkpoint" in told
     assert (found.step, found.field.weight[0, 0].item()) == (1, 1)
     folder.save_checkpoint(found)
     folder.checkpoint.unlink()  # killed before the new one was in its place
@@ -121,5 +121,5 @@ def test_with_both_checkpoints_damaged_the_run_begins_anew(tmp_path):
         (tmp_path / name).write_bytes(b"junk")
     told = records.RunFolder(tmp_path).load_checkpoint(begun)
     assert told.count("is damaged") == 2
-    assert told.endswith("the run begins anew.")
+    assert told.endswith("restarting the run.")
     assert (begun.step, torch.equal(field.weight, before)) == (0, True)

@@ -97,7 +97,7 @@ def test_two_sweeps_at_once_keep_their_numbers_apart(where, launcher, alone, tmp
             assert sorted(each.returncode for each in done) == [0, 2]
             (refused,) = (each for each in done if each.returncode)
             told = complaint(refused)
-            assert "all' holds another sweep" in told or "is at work in 'all'" in told
+            assert "all' holds another sweep" in told or "is using 'all'" in told
         else:
             assert [each.returncode for each in done] == [0, 0], done[0].stderr + done[1].stderr
             names = [path.name for path in found]
@@ -200,7 +200,7 @@ def test_a_sweep_that_is_at_work_keeps_its_folder(swept):
     cwd, asked = swept
     with locks.hold(cwd / "all"):
         told = complaint(styleexp(*asked, cwd=cwd))
-    assert "another process is at work in 'all'" in told
+    assert "another process is using 'all'" in told
     assert "hydra.sweep.dir=FOLDER" in told
 
 
@@ -290,7 +290,7 @@ def test_a_plan_refuses_another_run_in_a_jobs_folder(swept, tmp_path):
     )
     told = complaint(done)
     assert job.name in told
-    assert "is not this plan's" in told
+    assert "doesn't belong to this plan" in told
     assert record(job.folder) == record(swept[0] / "all" / "1")
 
 
@@ -311,7 +311,7 @@ def test_a_job_does_not_replace_another_run(swept):
 
     folder = swept[0] / "all" / "1"
     before = {p: p.read_bytes() for p in folder.iterdir() if p.is_file()}
-    with pytest.raises(UserError, match="is not this job's, the folder holds another run"):
+    with pytest.raises(UserError, match="doesn't belong to this job: the folder holds another run"):
         run(compose(["source=torus", "style=scales", *TINY]), folder, ["style=scales"], again=False)
     assert {p: p.read_bytes() for p in folder.iterdir() if p.is_file()} == before
     assert Job("1", (), folder).key is None

@@ -133,14 +133,14 @@ def test_a_style_in_memory_is_a_style_from_a_file(ball, tmp_path):
         ((np.full((3, 3), np.nan), np.array([[0, 1, 2]])), "bubble", "NaN"),
         (7, "bubble", "the source is a int"),
         ("torus", np.zeros((40, 40, 2)), "the style is an array of shape"),
-        ("torus", np.full((40, 40), 7.0), r"not all in \[0, 1\]"),
+        ("torus", np.full((40, 40), 7.0), r"outside \[0, 1\]"),
         ("torus", np.zeros((40, 40), np.int64), "picture of int64"),
         ("torus", np.zeros((4, 40)), "at least 16"),
         ("torus", "bubbel", "unknown style 'bubbel'"),
-        ((iter("ab"), iter("ab")), "bubble", "no pair of numeric arrays"),
+        ((iter("ab"), iter("ab")), "bubble", "not a pair of numeric arrays"),
         ((np.eye(3) * 1j, np.array([[0, 1, 2]])), "bubble", "complex"),
-        ("torus", np.full((40, 40), 0.5), "a picture of one tone"),
-        ("torus", np.full((40, 40, 3), 255, np.uint8), "a picture of one tone"),
+        ("torus", np.full((40, 40), 0.5), "a picture of uniform tone"),
+        ("torus", np.full((40, 40, 3), 255, np.uint8), "a picture of uniform tone"),
     ],
 )
 def test_what_can_not_be_taken_is_said_in_one_sentence(source, style, told):

@@ -129,7 +129,7 @@ def broken(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(cwd)
         patch.setenv("STYLEEXP_PLUGINS", "logger=lab_logger:BROKEN")
-        told = "'broken' stopped .the server is gone.; the run goes on"
+        told = "'broken' failed .the server is gone.; the run continues"
         with pytest.warns(UserWarning, match=told):
             assert stylise(cwd / "run", "logger=broken") == 0
     return cwd / "run"
@@ -168,5 +168,5 @@ def test_a_store_that_cannot_be_used_is_named(tmp_path):
     (tmp_path / "notes.db").write_text("not a database, but long enough to look at " * 9)
     config = compose.compose([*SMOKE, "logger=mlflow"])
     config.logger["mlflow"].uri = f"sqlite:///{tmp_path / 'notes.db'}"
-    with pytest.raises(UserError, match=r"^MLflow's store 'sqlite:.*notes.db' can't be used"):
+    with pytest.raises(UserError, match=r"^the MLflow store 'sqlite:.*notes.db' can't be used"):
         Loggers(config, tmp_path, records.describe(config, [], []), 0)

@@ -163,7 +163,7 @@ def test_two_runs_with_the_two_halves_put_two_styles_on_one_mesh(tmp_path):
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        (("style.mask=north",), "style.mask=north is no mask: give attribute:NAME, color:"),
+        (("style.mask=north",), "style.mask=north is not a mask: give attribute:NAME, color:"),
         (("style.mask=slope:steep",), "give slope: and 0 to 180 degrees"),
         (("style.mask=height:0.7..0.2",), "give height:LOW..HIGH"),
         (("style.mask=color:red",), "give color:r|g|b|a|luminance"),
@@ -172,7 +172,7 @@ def test_two_runs_with_the_two_halves_put_two_styles_on_one_mesh(tmp_path):
         (("style.mask=texture:no.png",), "has no texture coordinates"),
         (("style.mask=[slope:20,not:slope:30]",), "slope:20, not:slope:30 selects no vertex"),
         (("style.mask=attribute:right", "source.remesh=9000"), "is lost with source.remesh"),
-        (("style.mask=slope:30", "method=geometric_textures"), "faces of its own"),
+        (("style.mask=slope:30", "method=geometric_textures"), "remeshes the result"),
         (("style.direction=attribute:left", "method=synthesis"), "it has 'right'"),
         (("style.direction=attribute:right", "method=synthesis"), "a vector (three numbers)"),
         (("style.direction=flow",), "style.direction=flow needs method=synthesis"),
@@ -186,7 +186,7 @@ def test_what_is_no_mask_of_this_source_is_said_in_one_sentence(options, told):
 
 def test_values_that_are_no_shares_are_refused():
     given = painted_ball(paint=lambda v: 255 * right(v))
-    with pytest.raises(UserError, match="go from 0 to 255, and a mask's from 0 to 1"):
+    with pytest.raises(UserError, match="range from 0 to 255, but a mask must be in 0 to 1"):
         styleexp.stylize(given, "bubble", *MAP, "style.mask=attribute:paint")
 
 

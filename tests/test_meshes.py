@@ -397,7 +397,7 @@ def test_glb_scene_is_joined_in_world_space_and_written_back(scene, tmp_path):
     mesh = meshes.load_mesh(scene)
     original = trimesh.load(scene)
     assert set(mesh.carrier.parts) == {"left", "right", "box", "hat"}
-    assert not any("inside out" in note for note in mesh.repairs)  # mirrored, not inverted
+    assert not any("pointed inwards" in note for note in mesh.repairs)  # mirrored, not inverted
     for node in mesh.carrier.parts:
         faces = mesh.faces[np.array(part_names(mesh)) == node]
         matrix, name = original.graph[node]
@@ -466,7 +466,7 @@ def test_inward_mesh_is_turned_and_saved_as_it_came(tmp_path):
     inward = triangles()[:, ::-1]
     mesh = meshes.load_mesh(write_obj(tmp_path / "a.obj", CUBE, inward))
     assert volume(mesh.vertices, mesh.faces) > 0
-    assert any("inside out" in note for note in mesh.repairs)
+    assert any("pointed inwards" in note for note in mesh.repairs)
     for extension in ("obj", "ply", "glb"):
         out = tmp_path / f"b.{extension}"
         meshes.save_mesh(mesh, mesh.vertices, out)
@@ -586,11 +586,11 @@ BAD = {
     "unknown.xyz": (b"1 2 3\n", "supported mesh files are .obj"),
     "noextension": (b"1 2 3\n", "no extension"),
     "gone.gltf": (json.dumps(GLTF_GONE).encode(), "gone.bin"),
-    "list.gltf": (b"[1, 2]", "no glTF"),
+    "list.gltf": (b"[1, 2]", "not glTF"),
     "cut.glb": (struct.pack("<4sIII4s", b"glTF", 2, 999, 900, b"JSON") + b"{}", "ends too early"),
     "cut.ply": (ply("binary_little_endian")[:-9], "cut.ply"),
     "cut.off": (b"OFF\n3 1 0\n0 0 0\n", "ends too early"),
-    "header.ply": (b"ply\nformat ascii 1.0\n", "a header without end"),
+    "header.ply": (b"ply\nformat ascii 1.0\n", "an unterminated header"),
     **{f"junk{k}": (JUNK, "junk") for k in READABLE},
     **{f"text{k}": (b"hello, world\n" * 20, "text") for k in READABLE},
 }  # fmt: skip
@@ -624,7 +624,7 @@ def test_missing_file_folder_and_forbidden_file(tmp_path, monkeypatch):
     # The superuser may read everything, so the system's refusal is played.
     path = write_obj(tmp_path / "a.obj", CUBE, QUADS)
     monkeypatch.setattr(Path, "read_bytes", forbidden)
-    with pytest.raises(UserError, match="may not be read"):
+    with pytest.raises(UserError, match="is not readable"):
         meshes.load_mesh(path)
 
 
@@ -640,7 +640,7 @@ def test_every_truncation_of_a_good_file_is_either_read_or_explained(tmp_path, s
 
 def test_saving_says_what_is_wrong(tmp_path):
     mesh = meshes.load_mesh(write_obj(tmp_path / "a.obj", CUBE, QUADS))
-    with pytest.raises(UserError, match=r"supported are \.ply, \.obj, \.glb"):
+    with pytest.raises(UserError, match=r"supported formats are \.ply, \.obj, \.glb"):
         meshes.save_mesh(mesh, mesh.vertices, tmp_path / "b.stl")
     with pytest.raises(UserError, match="diverged"):
         meshes.save_mesh(mesh, mesh.vertices * np.nan, tmp_path / "b.ply")

@@ -255,7 +255,7 @@ def test_a_missing_result_is_one_sentence(tmp_path, capsys):
 
 def test_a_folder_without_runs_is_one_sentence(tmp_path, capsys):
     assert main(["board", str(tmp_path), "--judge", "vgg19_random"]) == 2
-    assert "holds no run" in capsys.readouterr().err
+    assert "contains no run" in capsys.readouterr().err
     assert main(["run", str(tmp_path), "--judge", "none"]) == 2
     assert "run.json" in capsys.readouterr().err
 
@@ -330,7 +330,7 @@ def test_a_board_is_measured_anew_and_says_which_runs_are_not_done(board, capsys
     assert "failed, not done" in next(r for r in found["runs"] if r["run"] == "failed")["status"]
     assert "style_distance" in json.loads(measured.read_text())
     assert main(command) == 0
-    assert "told apart" in capsys.readouterr().out
+    assert "identified: " in capsys.readouterr().out
 
 
 def test_a_run_measured_from_its_file_is_as_it_was_measured_when_it_ended(board, capsys):

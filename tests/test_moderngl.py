@@ -226,7 +226,7 @@ except UserError as error:
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "SAME" in done.stdout or "process of its own" in done.stdout
+    assert "SAME" in done.stdout or "separate process" in done.stdout
 
 
 # What users meet

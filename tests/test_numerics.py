@@ -114,7 +114,7 @@ def test_the_command_names_the_last_good_checkpoint(tmp_path, monkeypatch):
     checkpoint = tmp_path / "run" / "checkpoint.safetensors"
     told = str(caught.value)
     assert "the loss of the global views became NaN or infinite at step 2" in told
-    assert f"The last good checkpoint is that of step 2, {checkpoint}." in told
+    assert f"The last good checkpoint is from step 2: {checkpoint}." in told
     status = json.loads((tmp_path / "run" / "status.json").read_text())
     assert (status["status"], status["reason"]) == ("failed", told)
     from safetensors.numpy import load_file
@@ -142,7 +142,7 @@ def test_blank_views_are_counted_step_by_step_and_change_nothing(scene):
 
 
 def test_a_mesh_that_no_view_sees_is_told_before_the_run():
-    with pytest.raises(UserError, match="the views see nothing of the source"):
+    with pytest.raises(UserError, match="the views don't see"):
         prepare(compose([*SMOKE, "source=torus", "views.distance=900", "views.local.mode=image"]))
 
 

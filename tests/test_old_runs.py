@@ -95,7 +95,7 @@ def test_one_is_measured_and_resumed_from_a_checkpoint_without_a_digest(old, cap
     assert metrics_command(["run", str(at), "--judge", "none"]) == 0
     assert resume(at) == 0  # there is no checkpoint: from the first step on
     told = capsys.readouterr().out
-    assert "the run was begun with " in told
+    assert "the run was started with " in told
     assert "torch 2.0.1 (now " in told
     whole = (at / "result.ply").read_bytes()
     checkpoint = at / "checkpoint.previous.safetensors"
@@ -117,7 +117,7 @@ def test_options_that_are_no_more_are_named(old, capsys):
 def test_those_of_later_versions_are_refused_and_left_alone(old, capsys, monkeypatch, tmp_path):
     at = old(LATER, "sweep/0", schema=SCHEMA + 1)
     before = {path.name: path.read_bytes() for path in at.iterdir()}
-    says = rf"its layout is {SCHEMA + 1}, and this version of styleexp reads layouts up to {SCHEMA}"
+    says = rf"its layout is {SCHEMA + 1}, but this version of styleexp reads layouts up to {SCHEMA}"
     with pytest.raises(UserError, match=rf"cannot resume.*{says}"):
         resume(at)
     assert re.search(says, refused(capsys, metrics_command(["run", str(at), "--judge", "none"])))

@@ -109,12 +109,12 @@ def test_a_hangup_is_an_interruption(interrupted):
     status = json.loads((home / "run" / "status.json").read_text())
     assert status["status"] == "interrupted"
     assert (home / "run" / "checkpoint.safetensors").exists()
-    assert "go on with: styleexp " in told
+    assert "continue with: styleexp " in told
 
 
 def test_the_command_that_was_printed_works_from_any_folder(interrupted, tmp_path):
     home, told = interrupted
-    printed = told.split("go on with: ")[1].strip()
+    printed = told.split("continue with: ")[1].strip()
     assert "home dir" in printed  # a space: it has to be quoted
     save("sphere", tmp_path / "t.ply", detail=3000)
     done = run(*shlex.split(printed), cwd=tmp_path)
@@ -125,7 +125,7 @@ def test_the_command_that_was_printed_works_from_any_folder(interrupted, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("change", "told"), [("changed", "has changed since the run began"), ("gone", "is gone")]
+    ("change", "told"), [("changed", "has changed since the run began"), ("gone", "is missing")]
 )
 def test_a_source_that_changed_or_is_gone_is_refused_by_its_name(change, told, lain):
     home, elsewhere = lain
@@ -136,7 +136,7 @@ def test_a_source_that_changed_or_is_gone_is_refused_by_its_name(change, told, l
     before = content(home)
     said = complaint(run("styleexp", f"resume={home / 'run'}", cwd=elsewhere))
     assert f"its source '{home / 't.ply'}' {told}" in said
-    assert "put it back as it was, or start the run anew" in said
+    assert "restore it, or start the run again" in said
     assert {p: b for p, b in content(home).items() if p.name != ".lock"} == {
         p: b for p, b in before.items() if p.name != ".lock"
     }
@@ -188,7 +188,7 @@ def test_metrics_maps_and_boards_refuse_another_source(change, moved, capsys):
         told = capsys.readouterr().err
         assert told.count("\n") == 1, told
         assert f"its source '{moved / 't.ply'}' " in told
-        assert "put it back as it was, or start the run anew." in told
+        assert "restore it, or start the run again." in told
     assert not (moved / "run" / "bake").exists()
     # A page shows what there is, and names what there is not.
     assert report([str(moved / "run")]) == 0
@@ -273,12 +273,12 @@ def test_a_record_of_an_earlier_version_finds_its_file_by_its_content(tmp_path, 
     folder = tmp_path / "outputs" / "t-bubble"
     assert origins.find(record, config, "source", folder, notes.append) == tmp_path / "t.ply"
     assert len(notes) == 1
-    assert "is the same file, by its sha256" in notes[0]
+    assert "which has the same sha256" in notes[0]
     save("sphere", tmp_path / "t.ply")
     with pytest.raises(UserError, match=r"its source 't.ply' has changed .*looked for in '"):
         origins.find(record, config, "source", folder)
     record["assets"] = {}
-    with pytest.raises(UserError, match=r"no sha256 of its source 't.ply': start the run anew"):
+    with pytest.raises(UserError, match=r"no sha256 of its source 't.ply': start the run again"):
         origins.find(record, config, "source", folder)
 
 
@@ -295,7 +295,9 @@ def test_a_plan_goes_on_from_another_folder(tmp_path):
     again = run("styleexp.cli.sweep", "../plan.yaml", "--folder", "../out",
                 cwd=tmp_path / "elsewhere")  # fmt: skip
     assert again.returncode == 0, again.stderr
-    assert f"note: files are named from '{tmp_path}', where this plan was begun" in again.stdout
+    assert (
+        f"note: relative paths refer to '{tmp_path}', where this plan was started" in again.stdout
+    )
     assert "done in" not in again.stdout
     assert [job["state"] for job in manifest.read(tmp_path / "out").values()] == ["done"]
     assert manifest.home(tmp_path / "out") == tmp_path

@@ -117,10 +117,10 @@ def test_synthesis_takes_the_same_heights():
 @pytest.mark.parametrize(
     ("picture", "options", "told"),
     [
-        (grey(bumps() / 10 + 0.5), ("style.kind=normal",), "is no tangent-space normal map"),
-        (grey(bumps() / 10 + 0.5), ("style.image_depth=0.2",), "read with style.kind=height alone"),
-        (grey(np.full((32, 32), 0.5)), ("style.kind=height",), "a picture of one tone"),
-        ("bubble", ("style.invert=true",), "style.invert=true says how to read a picture"),
+        (grey(bumps() / 10 + 0.5), ("style.kind=normal",), "is not a tangent-space normal map"),
+        (grey(bumps() / 10 + 0.5), ("style.image_depth=0.2",), "only applies to style.kind=height"),
+        (grey(np.full((32, 32), 0.5)), ("style.kind=height",), "a picture of uniform tone"),
+        ("bubble", ("style.invert=true",), "style.invert=true only applies to pictures"),
         ("bubble", ("style.kind=sketch",), "style.kind"),
         (grey(bumps() / 10 + 0.5), ("style.kind=height", "method=robust"), "add method=synthesis"),
     ],

@@ -235,8 +235,8 @@ def test_plugins_are_listed_with_what_they_come_from(listed):
     ("name", "reason"),
     [
         ("no_spec", "is of type dict, not styleexp.registry.Spec"),
-        ("other_name", "is named 'another', its entry point 'other_name'"),
-        ("no_dataclass", "has a config that is no dataclass"),
+        ("other_name", "is named 'another', but its entry point is 'other_name'"),
+        ("no_dataclass", "has a config that is not a dataclass"),
         ("nameless", "unexpected keyword argument 'name'|lacks the field 'name'"),
         ("untyped", "Unsupported|Unexpected|ValidationError"),
         ("no_attribute", "AttributeError: .*NOWHERE"),
@@ -269,7 +269,7 @@ def test_of_two_plugins_with_one_name_none_is_taken(installed, listed, tmp_path)
 
 def test_built_in_names_are_kept_and_the_refusal_is_told(installed, listed, tmp_path):
     refused = listed["renderers", "soft_raster", "1.2"]["reason"]
-    assert refused == "styleexp has that name, second (lab:SHADOW) can't have it"
+    assert refused == "styleexp has that name already, so second (lab:SHADOW) can't use it"
     done = styleexp("style=bubble", "optim.steps=0", *SMOKE, cwd=tmp_path, path=installed)
     assert "optim.steps=0" in done.stderr
     assert f"warning: renderer=soft_raster: {refused}." in done.stderr
@@ -290,7 +290,7 @@ def test_help_shows_the_options_and_names_the_broken_and_loads_nothing_heavy(ins
         (choices,) = [line for line in lines if line.startswith(f"{kind}: ")]
         assert f"lab_{kind}" in choices
     assert "samples: 1" in done.stdout
-    (broken,) = [line for line in lines if "styleexp-plugins says why" in line]
+    (broken,) = [line for line in lines if "see styleexp-plugins" in line]
     assert "renderer=broken_import" in broken
     (choices,) = [line for line in lines if line.startswith("renderer: ")]
     assert "broken_import" not in choices

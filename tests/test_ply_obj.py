@@ -288,7 +288,9 @@ def test_what_a_ply_has_besides_is_named(tmp_path):
     path.write_bytes(ply_file([("vertex", table), edges, faces]))
     assert meshes.load_mesh(path).repairs == ("left out the element 'edge' of the PLY file",)
     path.write_bytes(ply_file([("vertex", table), strip]))
-    with pytest.raises(UserError, match="triangle strips, which are not read: export it again"):
+    with pytest.raises(
+        UserError, match="triangle strips, which are not supported: export it again"
+    ):
         meshes.load_mesh(path)
 
 

@@ -125,7 +125,7 @@ def test_a_run_refines_for_its_style_and_says_so():
     longest = as_trimesh(fine.source).edges_unique_length.max() / fine.frame.scale
     assert longest <= 1 / fine.sigma / scene.PER_WAVE * (1 + 1e-9)
     assert any("refined from" in note for note in fine.notes)
-    assert not any("is coarse" in note for note in fine.notes)
+    assert not any("is too coarse" in note for note in fine.notes)
 
 
 def test_a_run_refines_to_a_number_of_faces():

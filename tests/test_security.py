@@ -118,7 +118,7 @@ def test_a_runs_record_is_values_alone(tmp_path):
         resume(tmp_path)
     for wrong in (None, [], "text", {"optim": 3}, {"no such key": 1}):
         (tmp_path / "run.json").write_text(json.dumps({"schema": 1, "config": wrong}))
-        with pytest.raises(UserError, match="no configuration of this version"):
+        with pytest.raises(UserError, match="not a valid configuration for this version"):
             resume(tmp_path)
 
 

@@ -69,7 +69,7 @@ def test_check_renderer_reports_all_failures(monkeypatch: pytest.MonkeyPatch) ->
     assert testing.check_renderer(HardRaster()) == {
         "orientation": "passed",
         "crop_is_part_of_whole": "passed",
-        "triangle_area": "not applicable: does not differentiate visibility",
+        "triangle_area": "not applicable: is not differentiable w.r.t. visibility",
     }
 
 

@@ -74,7 +74,7 @@ def test_the_length_that_parts_them_can_be_given():
 
 @pytest.mark.parametrize("refine", ["none", "auto"])
 def test_a_smooth_style_is_noted_and_gives_the_source_back(refine):
-    with pytest.warns(UserWarning, match="'sphere' has no relief to speak of"):
+    with pytest.warns(UserWarning, match="'sphere' has no relief, its surface"):
         result = styleexp.stylize("critter", "sphere", *CHEAP, f"source.refine={refine}")
     np.testing.assert_array_equal(result.vertices, shapes.make("critter").vertices)
 

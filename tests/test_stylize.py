@@ -229,6 +229,6 @@ def test_a_stray_triangle_is_the_remedy_not_the_camera(tmp_path):
     stray = np.vstack([ball.vertices, far]), np.vstack([ball.faces, [[642, 643, 644]]])
     with pytest.raises(UserError, match=r"1 of the 1281 faces of the source .* number 1280"):
         styleexp.stylize(stray, "bubble", *SMOKE)
-    assert "lie far from all others" not in str(
+    assert "are far from all others" not in str(
         styleexp.stylize("critter", "bubble", *SMOKE).scene.notes
     )

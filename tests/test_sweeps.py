@@ -107,7 +107,7 @@ def test_the_key_is_of_what_the_result_follows_from(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("experiments: []", "names no experiments"),
+        ("experiments: []", "lists no experiments"),
         ("experiments:\n  - {experimnt: board}", "did you mean 'experiment'"),
         ("launchr: joblib\nexperiments:\n  - {experiment: board}", "did you mean 'launcher'"),
         ("experiments:\n  - {figure: Fig. 2}", "no experiment and no name"),
@@ -235,7 +235,7 @@ def test_a_run_refuses_a_folder_that_another_process_is_at(tmp_path):
             "-m", "styleexp", "source=torus", "style=rail", "hydra.run.dir=run", cwd=tmp_path
         )
     assert done.returncode == 2
-    assert "another process is at work in" in done.stderr
+    assert "another process is using" in done.stderr
     assert not (tmp_path / "run" / "run.json").exists()
 
 
@@ -466,7 +466,7 @@ def test_what_slurm_is_asked_for(tmp_path):
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
     told = done.stderr.strip().splitlines()[-1]
-    assert told.startswith("styleexp-sweep: the launcher failed before any job began (sbatch: ")
+    assert told.startswith("styleexp-sweep: the launcher failed before any job started (sbatch: ")
     asked = (tmp_path / "submitted.sh").read_text()
     for line in (
         f"--array=0-{JOBS - 1}%3",

@@ -59,7 +59,7 @@ def test_singles_off_by_a_unit_in_the_last_place_are_one(tmp_path, kind, seed, o
     assert len(mesh.vertices) == len(points)
     told = [note for note in mesh.repairs if "origin" not in note]
     assert len(told) == 1
-    assert told[0].startswith(f"joined {apart - len(points)} vertices within ")
+    assert told[0].startswith(f"merged {apart - len(points)} vertices within ")
     exact = meshes.load_mesh(path, 0)
     assert len(exact.vertices) == apart
     assert any("nearly coincide" in note for note in exact.repairs)

@@ -1,4 +1,4 @@
-"""What the renderer changes: the runs of one sweep side by side, compared with the first.
+"""Compare the runs of a sweep over renderers with the first run.
 
 ``+experiment=backend_agreement`` writes ``figure.png`` (a row of views for each run, and their
 absolute difference from the first run's), ``agreement.json`` and a table on the terminal.
@@ -21,17 +21,17 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 DIFFERENCE_GAIN = 4
-"""How much darker than they are differences are drawn."""
+"""Contrast factor for drawing differences."""
 
 HELD_OUT_SEED = 1_000_003
-"""Added to the first run's seed for cameras that no run of the sweep was trained with."""
+"""Seed offset for held-out cameras, which no run of the sweep was trained with."""
 
 
 class OnSweepEnd(report.OnSweep):
-    """Hydra's callback: compare when all jobs are over, instead of the usual report."""
+    """Hydra callback: compare when all jobs have ended, instead of writing the usual report."""
 
     def on_multirun_end(self, config: DictConfig, **rest: Any) -> None:
-        """Compare the runs in the sweep's folder; those that failed are listed as failed."""
+        """Compare the runs in the sweep's folder; failed runs are listed as failed."""
         folder = Path(config.hydra.sweep.dir)
         rows = compare(folder)
         atomic.write(folder / "agreement.json", atomic.text(json.dumps(rows, indent=2) + "\n"))
@@ -39,14 +39,14 @@ class OnSweepEnd(report.OnSweep):
 
 
 def compare(folder: Path) -> list[dict[str, Any]]:
-    """One row for each job of the sweep in ``folder``, in their order; draws ``figure.png``.
+    """Return one row per job of the sweep in ``folder``, in order, and draw ``figure.png``.
 
-    ``distance`` is the root mean square distance of the result's vertices from the first run's, as
-    a share of the first's root mean square displacement; ``correlation`` that of both
-    displacements; ``picture`` the mean absolute difference of four views, in [0, 1]. ``loss`` is
-    the mean of the last tenth of the steps, each measured by the run's own renderer.
-    ``held_out_loss`` is measured by the first run's renderer and encoder for all: the loss at
-    views that were not trained on, as a share of the source's own; 1 means no style was gained.
+    ``distance`` is the RMS distance of the result's vertices from the first run's, relative to the
+    first run's RMS displacement; ``correlation`` is the correlation of the two displacements;
+    ``picture`` is the mean absolute difference of four views, in [0, 1]. ``loss`` is the mean over
+    the last tenth of the steps, measured with the run's own renderer. ``held_out_loss`` is measured
+    with the first run's renderer and encoder for all runs: the loss at held-out views relative to
+    the source's; 1 means no style was gained.
     """
     import numpy as np
 
@@ -84,7 +84,7 @@ def compare(folder: Path) -> list[dict[str, Any]]:
     _draw(pictures, folder / "figure.png")
     try:
         distances = held_out_losses(folder / results[0][0]["run"], [v for _, v, *_ in results])
-    except UserError as error:  # a file of the first run has changed: the rest can be told
+    except UserError as error:  # a file of the first run has changed; report the rest
         print(f"note: held_out_loss is not measured: {error}")
         distances = [None] * len(results)
     for (row, *_), distance in zip(results, distances, strict=True):
@@ -93,10 +93,10 @@ def compare(folder: Path) -> list[dict[str, Any]]:
 
 
 def held_out_losses(run: Path, results: list[np.ndarray]) -> list[float] | list[None]:
-    """Loss of each result (vertices, 3) at the style bank's views over the source's loss there,
-    with the settings and the files of ``run``. Raises `UserError` where those have changed.
+    """Loss of each result (vertices, 3) at the style bank's views, relative to the source's loss,
+    with the settings and files of ``run``. Raises `UserError` if those have changed.
 
-    None for all where the results were saved with more vertices than the source, split at seams.
+    All entries are None if results were saved with more vertices than the source, split at seams.
     """
     import torch
 
@@ -125,7 +125,7 @@ def held_out_losses(run: Path, results: list[np.ndarray]) -> list[float] | list[
 
 
 def _result(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices, faces and displacement of a result, as they stand in its file."""
+    """Vertices, faces and displacement of a result, as stored in its file."""
     from styleexp.meshes.ply import stored_result
 
     vertices, faces, displacement = stored_result(path.read_bytes())
@@ -181,6 +181,6 @@ def _print_table(rows: list[dict[str, Any]], folder: Path) -> None:
         table.add_row(*(f"{c:.4g}" if isinstance(c, float) else str(c) for c in cells))
     console = Console()
     if not console.is_terminal:
-        console = Console(width=120)  # a log has no width; keep the columns' names whole
+        console = Console(width=120)  # a log has no width; don't wrap column names
     console.print(table)
     console.print(f"{folder}/figure.png, {folder}/agreement.json", soft_wrap=True)

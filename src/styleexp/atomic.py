@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all, however the process or the machine ends."""
+"""Atomic file writes: after a crash a file is complete or absent."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from pathlib import Path
 from typing import Any
 
 MARK = ".partial"
-"""In the names of files that are being written; all of them begin with a dot."""
+"""Marker in the names of files that are being written; these names begin with a dot."""
 A_DAY = 86400.0
-"""Seconds after which nobody is writing a file any more."""
+"""Seconds after which a partial file counts as abandoned."""
 
 
 def write(target: Path, writer: Callable[[Path], Any]) -> Path:
-    """Let ``writer`` write under a name of its own beside ``target``, then move it into place.
+    """Let ``writer`` write a temporary file next to ``target``, then move it into place.
 
-    Content and name are on the disk when this returns. Readers see the old file or the new one, and
-    of several writers the last one wins. Raises ``OSError`` where the folder can't be written.
+    Content and name are synced to disk on return. Readers see the old file or the new one; with
+    several writers the last one wins. Raises ``OSError`` if the folder isn't writable.
     """
-    # The suffix stays last: writers choose the format by it.
+    # Keep the suffix last: writers infer the format from it.
     name = f".{target.stem}.{secrets.token_hex(4)}{MARK}{target.suffix}"
     partial = target.with_name(name)
     try:
@@ -40,19 +40,19 @@ def write(target: Path, writer: Callable[[Path], Any]) -> Path:
 
 
 def text(content: str) -> Callable[[Path], Any]:
-    """A writer of UTF-8 text, for `write`."""
+    """Return a writer of UTF-8 text, for `write`."""
     return lambda path: path.write_text(content, encoding="utf-8")
 
 
 def data(content: bytes) -> Callable[[Path], Any]:
-    """A writer of bytes, for `write`."""
+    """Return a writer of bytes, for `write`."""
     return lambda path: path.write_bytes(content)
 
 
 def sweep(folder: Path, seconds: float = 0.0) -> None:
-    """Remove what writers that were killed left in ``folder``, if it is older than ``seconds``.
+    """Remove partial files of killed writers in ``folder`` that are older than ``seconds``.
 
-    Without an age the caller knows, by a lock, that nobody is writing there.
+    With the default of 0 the caller must hold a lock, so that nobody is writing there.
     """
     for left in folder.glob(f".*{MARK}*"):
         with suppress(OSError):
@@ -65,7 +65,7 @@ def sweep(folder: Path, seconds: float = 0.0) -> None:
 
 
 def _sync(folder: Path) -> None:
-    """Bring a folder's names to the disk, where the system can."""
+    """Sync a folder's entries to disk, where the system can."""
     with suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:

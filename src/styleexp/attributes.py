@@ -1,4 +1,4 @@
-"""What a source's file says of its vertices under names of its own: numbers and vectors."""
+"""Named per-vertex attributes of a source file: numbers and vectors."""
 
 from __future__ import annotations
 
@@ -15,25 +15,27 @@ if TYPE_CHECKING:
     from styleexp.meshes import Mesh
 
 ATTRIBUTE = "attribute:"
-"""What such a name is written after, in the configuration."""
+"""Prefix of attribute names in the configuration."""
 
 
 def numbers(source: Mesh, name: str, key: str) -> Float[np.ndarray, " vertices"]:
-    """A number at each vertex, as the file has it. ``key`` is who asks; see `_found` for errors."""
+    """A scalar attribute at each vertex, as stored. ``key`` names the option in errors; see
+    `_found`."""
     return _found(source, name, key, 1, "a number")[:, 0]
 
 
 def vectors(source: Mesh, name: str, key: str) -> Float[np.ndarray, "vertices 3"]:
-    """A vector at each vertex in the source's frame, of length 1, or 0 where the file's has none.
+    """A vector attribute at each vertex in the source's frame, of length 1, or 0 where the file's
+    is 0.
 
-    Raises `UserError` where all are 0; else as `_found`.
+    Raises `UserError` if all vectors are 0, and as `_found` does.
     """
     given = _found(source, name, key, 3, "a vector (three numbers)")
     length = np.linalg.norm(given, axis=1, keepdims=True)
     if not length.any():
         raise UserError(
-            f"{key}={ATTRIBUTE}{name}: all its vectors in '{source.name}' are 0, which points "
-            "nowhere: export the mesh with directions in it."
+            f"{key}={ATTRIBUTE}{name}: all its vectors in '{source.name}' are zero: export the "
+            "mesh with non-zero directions."
         )
     return given / np.where(length > 0, length, 1.0)
 
@@ -41,20 +43,20 @@ def vectors(source: Mesh, name: str, key: str) -> Float[np.ndarray, "vertices 3"
 def _found(
     source: Mesh, name: str, key: str, width: int, what: str
 ) -> Float[np.ndarray, "vertices width"]:
-    """The attribute at the vertices. Raises `UserError` where there is none of that name, naming
-    those there are, and where its width is another or its values aren't finite."""
+    """The attribute at the vertices. Raises `UserError` if the name is unknown (listing the known
+    ones), the width differs, or values aren't finite."""
     there = {} if source.carrier is None else source.carrier.attributes
     if name not in there:
         names = ", ".join(f"'{each}'" for each in there) or "none"
         raise UserError(
             f"{key}={ATTRIBUTE}{name}: the source '{source.name}' has no such vertex attribute; "
-            f"it has {names} (those of a PLY's own properties, or a glTF's '_NAME')."
+            f"it has {names} (custom properties of a PLY, or '_NAME' attributes of a glTF)."
         )
     values = there[name]
     if values.shape[1] != width:
         raise UserError(
-            f"{key}={ATTRIBUTE}{name}: at each vertex it has {values.shape[1]} numbers, and {what} "
-            "is needed: give another attribute."
+            f"{key}={ATTRIBUTE}{name}: it has {values.shape[1]} numbers per vertex, but {what} is "
+            "needed: give another attribute."
         )
     if not np.isfinite(values).all():
         raise UserError(

@@ -1,11 +1,11 @@
-"""A run's displacement as textures of its source: a height map and a tangent-space normal map.
+"""Bake a run's displacement into textures of its source: a height and a tangent-space normal map.
 
-Texture space: u goes right, v up, so v = 1 is a picture's first row; pixel centres lie at
-(column + 1/2, row + 1/2) / size. Texture coordinates repeat outside 0 to 1.
+Texture space: u points right, v up, so v = 1 is the first row of the image; pixel centres are at
+(column + 1/2, row + 1/2) / size. Texture coordinates wrap outside [0, 1].
 
 The height map holds the displacement along the source's smooth vertex normals. The normal map holds
-the result's smooth normals in the source's tangent space, as OpenGL, glTF and Blender have it: red
-along u, green along v (up in the picture), blue along the normal, each n / 2 + 1/2.
+the result's smooth normals in the source's tangent space, in the convention of OpenGL, glTF and
+Blender: red along u, green along v (up in the image), blue along the normal, each n / 2 + 1/2.
 """
 
 from __future__ import annotations
@@ -29,23 +29,24 @@ if TYPE_CHECKING:
     from styleexp.meshes import Mesh
 
 BATCH = 4_000_000
-"""Pairs of pixels and faces that are looked at together: some 100 MB."""
+"""Pixel-face pairs per batch, about 100 MB."""
 INSIDE = 1e-3
-"""A pixel nearer to an edge than this, in barycentric coordinates, is no sign of an overlap."""
+"""Barycentric distance to an edge below which a pixel doesn't count as overlap."""
 
 
 @dataclass(frozen=True)
 class Maps:
-    """What is baked, (size, size), first row at v = 1."""
+    """Baked maps of shape (size, size), first row at v = 1."""
 
     height: Float[np.ndarray, "size size"]
-    """Displacement in the source's own units; beside the islands that of the nearest pixel."""
+    """Displacement in the source's own units; outside the islands, that of the nearest covered
+    pixel."""
     normal: Float[np.ndarray, "size size 3"]
-    """Unit, in the source's tangent space."""
+    """Unit normals in the source's tangent space."""
     covered: Bool[np.ndarray, "size size"]
     """Pixels whose centre a face covers."""
     overlap: float
-    """Share of those that several faces cover: mirrored or stacked islands."""
+    """Fraction of covered pixels with several faces: mirrored or stacked islands."""
 
 
 def bake(
@@ -54,7 +55,7 @@ def bake(
     vertices: Float[np.ndarray, "vertices 3"],
     size: int,
 ) -> Maps:
-    """Bake ``displacement`` and the normals of ``vertices``, the result's, to the source's UVs.
+    """Bake ``displacement`` and the normals of ``vertices``, the result's, into the source's UVs.
 
     Raises `UserError` for a source without texture coordinates.
     """
@@ -89,25 +90,25 @@ def bake(
     if not covered.any():
         raise UserError(
             f"no pixel of {size} x {size} lies on a face of '{source.name}': its texture "
-            "coordinates have no area, unwrap it anew."
+            "coordinates have no area; unwrap it again."
         )
-    # Whoever filters at an island's border, in whichever mipmap, finds the border's value.
+    # Filtering at an island's border, at any mip level, sees the border's value.
     nearest = distance_transform_edt(~covered, return_distances=False, return_indices=True)
     height, normal = height[tuple(nearest)], normal[tuple(nearest)]
     return Maps(height, normal, covered, (taken > 1).sum() / max(1, (taken > 0).sum()))
 
 
 def coordinates(source: Mesh) -> tuple[Float[np.ndarray, "rows 2"], Int[np.ndarray, "faces 3"]]:
-    """The file's texture coordinates, and the rows of each face, wound as ``source.faces``.
+    """The file's texture coordinates, and each face's indices into them, wound as ``source.faces``.
 
-    Raises `UserError` where there are none.
+    Raises `UserError` if there are none.
     """
     carrier = source.carrier
     if carrier is None or carrier.uv is None or not np.ptp(carrier.uv, axis=0).all():
         raise UserError(
-            f"the source '{source.name}' has no texture coordinates, so there is nothing to bake "
-            "to: unwrap it (in Blender: Edit Mode, UV > Smart UV Project), export it as OBJ or GLB "
-            "and run again, without source.remesh, which drops them."
+            f"the source '{source.name}' has no texture coordinates to bake to: unwrap it (in "
+            "Blender: Edit Mode, UV > Smart UV Project), export it as OBJ or GLB and run again, "
+            "without source.remesh, which drops them."
         )
     corners = carrier.corners.copy()
     corners[carrier.flipped] = corners[carrier.flipped][:, ::-1]
@@ -121,11 +122,11 @@ def tangents(
     uv: Float[np.ndarray, "rows 2"],
     corners: Int[np.ndarray, "faces 3"],
 ) -> tuple[Float[np.ndarray, "rows 3"], Float[np.ndarray, " faces"]]:
-    """The direction of u at every row of the file, and the faces' handedness: 1, or -1 where the
-    texture is mirrored.
+    """Tangent (direction of u) at every texture coordinate, and each face's handedness: 1, or -1
+    where the texture is mirrored.
 
-    Like MikkTSpace: a face's direction of u, in the plane of each corner's normal, counts by the
-    corner's angle. Rows that only mirrored and unmirrored faces share are not split.
+    Like MikkTSpace, a face's tangent, projected onto the plane of each corner's normal, is weighted
+    by the corner's angle. Coordinates shared by mirrored and unmirrored faces are not split.
     """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     ua, ub, uc = (uv[corners[:, k]] for k in range(3))
@@ -147,8 +148,8 @@ def tangents(
 def pixels(
     uv: Float[np.ndarray, "faces 3 2"], size: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-    """The pixel centres that faces cover: faces, rows, columns (not wrapped) and barycentric
-    weights (n, 3), in batches."""
+    """Yield batches of pixel centres covered by faces: faces, rows, columns (not wrapped) and
+    barycentric weights (n, 3)."""
     at = uv * size - 0.5  # pixel centres are whole numbers, y up
     low = np.ceil(at.min(axis=1) - 1e-9).astype(np.int64)
     high = np.floor(at.max(axis=1) + 1e-9).astype(np.int64)
@@ -184,7 +185,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 def write(maps: Maps, folder: Path, kind: str) -> dict[str, Any]:
     """Write ``height`` and ``normal`` as PNG (16 bits a channel) or EXR (32-bit floats) into
-    ``folder``; returns how to read them, for ``bake.json``."""
+    ``folder``; return their description for ``bake.json``."""
     reach = float(np.abs(maps.height).max())
     height, normal = folder / f"height.{kind}", folder / f"normal.{kind}"
     encoded = maps.normal / 2 + 0.5
@@ -228,11 +229,11 @@ def _sixteen(values: np.ndarray) -> np.ndarray:
 
 
 def png(picture: UInt16[np.ndarray, ...]) -> bytes:
-    """A PNG of 16 bits a channel: (height, width) is grey, (height, width, 3) is RGB, which Pillow
-    can't write."""
+    """Encode a PNG with 16 bits per channel: (height, width) is grey, (height, width, 3) is RGB,
+    which Pillow can't write."""
     height, width = picture.shape[:2]
     rows = picture.astype(">u2").reshape(height, -1).view(np.uint8)
-    # Each row less the one above it ("up"): smooth pictures get much smaller.
+    # Filter "up", the difference to the row above: smooth pictures compress much better.
     above = np.vstack([np.zeros_like(rows[:1]), rows[:-1]])
     filtered = np.hstack([np.full((height, 1), 2, np.uint8), rows - above])
 

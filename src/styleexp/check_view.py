@@ -1,17 +1,17 @@
-"""Draws meshes with pyrender, in a process of its own: ``python -m styleexp.check_view IN OUT``.
+"""Draw meshes with pyrender in a separate process: ``python -m styleexp.check_view IN OUT``.
 
-``previews.write_check`` starts it. Two OpenGL libraries in one process get in each other's way, and
-this one must not share code with the renderers that it checks: it knows neither torch nor them.
+``previews.write_check`` starts it. Two OpenGL libraries in one process conflict, and this module
+must not share code with the renderers that it checks: it imports neither them nor torch.
 
 ``PYOPENGL_PLATFORM`` chooses ``egl`` or ``osmesa``. IN is an .npz of
 
 - ``vertices`` (V, 3) in world units, ``faces`` (F, 3), counter-clockwise from outside;
 - ``rotation`` (views, 3, 3), ``translation`` (views, 3), ``focal`` (views, 2), ``center``
   (views, 2) and ``near``, as in ``styleexp.renderers.base.Cameras``;
-- ``size``: pixels a side.
+- ``size``: side in pixels.
 
-OUT becomes an .npz of ``pictures`` (views, size, size), 8-bit grey, ``covered`` (views, size,
-size), bool, and ``device``, the name of what drew. Where OpenGL can't be had, the exit code is 3
+OUT is an .npz of ``pictures`` (views, size, size), 8-bit grey, ``covered`` (views, size, size),
+bool, and ``device``, the name of the OpenGL device. If OpenGL is not available, the exit code is 3
 and standard error ends with the reason.
 """
 
@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 UNAVAILABLE = 3
-"""Exit code where pyrender or OpenGL is missing; others are faults."""
+"""Exit code if pyrender or OpenGL is missing; any other non-zero code is a failure."""
 
 LIGHTS = ((0.8, 0.7, 0.6, 3.6), (-1.0, 0.2, 0.5, 0.7))
 """Directions towards the lights in camera space (x, y, z), and strengths."""
@@ -53,7 +53,7 @@ def draw(job: Mapping[str, np.ndarray]) -> dict[str, Any]:
             for node in _camera(scene, job, view, size):
                 scene.add_node(node)
             colour, _ = renderer.render(scene)
-            # Drawn anew, since pictures have four samples a pixel, none of them at its centre.
+            # Drawn again: pictures have four samples per pixel, none at its centre.
             mask, _ = renderer.render(scene, RenderFlags.SEG, {shown: 255})
             for node in (*scene.camera_nodes, *scene.light_nodes):
                 scene.remove_node(node)
@@ -70,7 +70,7 @@ def draw(job: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def _camera(scene: Any, job: Mapping[str, np.ndarray], view: int, size: int) -> list[Any]:
-    """The camera of a view, and the lights that move with it, as nodes."""
+    """Scene nodes of a view: the camera and the lights that move with it."""
     import pyrender
 
     rotation, translation = job["rotation"][view], job["translation"][view]
@@ -97,7 +97,7 @@ def _camera(scene: Any, job: Mapping[str, np.ndarray], view: int, size: int) -> 
 
 
 def _towards(direction: np.ndarray) -> np.ndarray:
-    """A pose whose +Z axis is ``direction``: lights shine along their -Z."""
+    """Pose whose +Z axis is ``direction``; lights shine along their -Z."""
     z = direction / np.linalg.norm(direction)
     x = np.cross((0.0, 1.0, 0.0), z)
     x /= np.linalg.norm(x)
@@ -113,7 +113,7 @@ def main() -> None:
         job = dict(opened)
     try:
         drawn = draw(job)
-    except Exception as error:  # PyOpenGL raises what ctypes and EGL happen to raise
+    except Exception as error:  # PyOpenGL passes on whatever ctypes and EGL raise
         reason = str(error).strip() or type(error).__name__
         print(f"{type(error).__name__}: {' '.join(reason.split())}", file=sys.stderr)
         sys.exit(UNAVAILABLE)

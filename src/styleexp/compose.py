@@ -1,7 +1,7 @@
-"""Hydra's configuration of this package, for the command line and for Python callers.
+"""Hydra configuration of this package, for the command line and for Python callers.
 
 The command line is a Hydra application and registers everything with Hydra (`register`). A Python
-caller may be another one: for it `compose` works on a store of its own.
+caller may itself be a Hydra application, so `compose` works on a separate store.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from styleexp.shapes import SOURCES, STYLES
 
 CONFIG_PATH = "pkg://styleexp.conf"
 PARTS = ("renderer", "encoder", "style", "field", "loss", "baseline")
-"""Keys of the configuration whose options are those of the part that they name. ``logger`` holds
-several, by their names."""
+"""Configuration keys whose options depend on the part they name. ``logger`` holds several parts,
+keyed by name."""
 
 
 def register() -> None:
-    """Make this process a Hydra application of ours: Hydra gets the schema, one option for each
-    registered name, and the check of what a configuration may call. Safe to call again."""
+    """Register with Hydra: the schema, one option per registered name, and the allow-list of call
+    targets. Safe to call again."""
     targets.guard()
     _fill(ConfigStore.instance())
     OmegaConf.register_new_resolver("run_name", _run_name, replace=True)
 
 
 def _fill(store: ConfigStore) -> None:
-    """The schema, and one option for each registered name."""
+    """Store the schema, and one option per registered name."""
     store.store(name="base_config", node=schema.Config)
     for name in map(str, schema.CHOICES["preview.name"]):
         store.store(group="preview", name=name, node={"name": name})
@@ -83,19 +83,22 @@ UNNAMED: dict[str, dict[str, Any]] = {
     "shading": {"lights": 1},
     "optim": {"unit_gradient": False},
 }
-"""What a record was made with that doesn't name these options, as it is older than they are."""
+"""Values for options that are missing in old records because they didn't exist yet."""
 
 
 def recorded(config: Any) -> schema.Config:
-    """The configuration of a run's record, which may come from anywhere: all of it is values.
+    """The configuration in a run's record, which is untrusted: only plain values are accepted.
 
-    Raises `UserError` for an interpolation, which could read the environment, and for what is not
-    a configuration of this version. A file's name may look like one, and isn't taken for one.
+    Raises `UserError` for an interpolation, which could read the environment, and for a
+    configuration that this version doesn't support. File names that look like interpolations are
+    allowed.
     """
     from omegaconf.errors import OmegaConfBaseException
 
     if "${" in json.dumps(_without_files(config), default=str):
-        raise UserError("the run's record holds an interpolation (${...}), not values alone.")
+        raise UserError(
+            "the run's record holds an interpolation (${...}), but only plain values are allowed."
+        )
     if isinstance(config, dict):
         for part, values in UNNAMED.items():
             if isinstance(config.get(part), dict):
@@ -105,20 +108,20 @@ def recorded(config: Any) -> schema.Config:
     except (OmegaConfBaseException, AssertionError, AttributeError, TypeError, ValueError) as error:
         told = (str(error).splitlines() or [type(error).__name__])[0]
         raise UserError(
-            f"the run's record is no configuration of this version ({told}): use the version of "
-            "styleexp that wrote it."
+            f"the run's record is not a valid configuration for this version ({told}): use the "
+            "version of styleexp that wrote it."
         ) from error
 
 
 def _without_files(node: Any) -> Any:
-    """A record without the values of keys that name files."""
+    """Copy of a record without the values of keys that name files."""
     if isinstance(node, dict):
         return {k: _without_files(v) for k, v in node.items() if k not in words.FILES}
     return [_without_files(value) for value in node] if isinstance(node, list) else node
 
 
 def _part(kind: str, plain: dict[str, Any] | None) -> Any:
-    """One part's options, of the dataclass that belongs to its name."""
+    """One part's options, as an instance of its registered dataclass."""
     name = (plain or {}).get("name")
     plugins.warn_of_rivals(kind, name)
     options = plugins.KINDS[kind].base
@@ -130,10 +133,10 @@ def _part(kind: str, plain: dict[str, Any] | None) -> Any:
 
 
 def compose(overrides: Sequence[str]) -> schema.Config:
-    """The configuration that the command line makes of these words.
+    """Compose the configuration for these command-line overrides.
 
-    Leaves everything that Hydra and OmegaConf keep for the whole process as it was, so that the
-    caller may be a Hydra application; may be called from several threads.
+    Restores Hydra's and OmegaConf's global state afterwards, so that the caller may be a Hydra
+    application. Thread-safe.
     """
     from hydra._internal.config_loader_impl import ConfigLoaderImpl
     from hydra._internal.utils import create_config_search_path
@@ -158,10 +161,10 @@ _ONE_AT_A_TIME = threading.RLock()
 
 @contextmanager
 def _own_hydra() -> Iterator[ConfigStore]:
-    """Put the state that Hydra keeps for the whole process aside, and back again.
+    """Swap out Hydra's global state, and restore it on exit.
 
-    Its store of configurations starts with Hydra's own alone: a host application may well have a
-    ``base_config`` and a group ``encoder``, too.
+    The new store holds only Hydra's own configurations, because the host application may define its
+    own ``base_config`` or group ``encoder``.
     """
     import copy
 
@@ -170,7 +173,7 @@ def _own_hydra() -> Iterator[ConfigStore]:
     from hydra.core.singleton import Singleton
 
     with _ONE_AT_A_TIME:
-        Plugins.instance()  # before the store is copied: plugins register, too
+        Plugins.instance()  # before copying the store: plugins register in it too
         theirs = Singleton._instances
         repo = ConfigStore.instance().repo
         Singleton._instances = {
@@ -188,10 +191,11 @@ def _own_hydra() -> Iterator[ConfigStore]:
 
 
 HYDRAS = ("hydra", "_dummy_empty_config_.yaml")
-"""What Hydra itself and its plugins keep at the top of their store of configurations."""
+"""Top-level entries of Hydra and its plugins in the configuration store."""
 
 NAME_LENGTH = 60
-"""Characters of a file's name that a run's folder begins with; file systems allow 255 bytes."""
+"""Maximum characters of a file's name in the name of a run's folder; file systems allow 255
+bytes."""
 
 
 def _run_name(source: Any, style: Any) -> str:
@@ -199,8 +203,7 @@ def _run_name(source: Any, style: Any) -> str:
 
     def short(part: Any) -> str:
         stem = PurePath(part.path).stem if part.path else str(part.name)
-        # Hydra reads its folder's name again as a configuration's value; shells and lists of
-        # files read it, too.
+        # Hydra parses the folder's name as a configuration value; shells parse it too.
         return re.sub(r"[\x00-\x1f\x7f$\\/]", "_", stem)[:NAME_LENGTH].strip() or "_"
 
     return f"{short(source)}-{short(style)}"
@@ -210,7 +213,7 @@ def _header(broken: Sequence[str]) -> str:
     if not broken:
         return HELP_HEADER
     told = re.sub(r"[^\w.:=, -]", "?", ", ".join(broken))  # the header is a template
-    return f"{HELP_HEADER}\nThese plugins can't be used, styleexp-plugins says why: {told}\n"
+    return f"{HELP_HEADER}\nThese plugins can't be used (see styleexp-plugins): {told}\n"
 
 
 HELP_HEADER = """\

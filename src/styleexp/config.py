@@ -3,8 +3,8 @@
 Hydra validates against these dataclasses. Their defaults are those of ``method=robust``. The
 command line and ``styleexp.stylize(...)`` start from ``conf/config.yaml``, whose
 ``method=synthesis`` sets ``baseline`` and ``source.refine``; ``conf/method`` holds the presets and
-``conf/profile`` the sizes. Section and equation numbers are the paper's. This module imports
-nothing heavy: ``styleexp --help`` reads it.
+``conf/profile`` the sizes. Section and equation numbers refer to the paper. This module imports
+nothing heavy, to keep ``styleexp --help`` fast.
 """
 
 from __future__ import annotations
@@ -21,21 +21,22 @@ from styleexp.errors import UserError, unknown_name
 
 @dataclass
 class SourceConfig:
-    """The source mesh C, whose shape is kept."""
+    """The source mesh C. Its overall shape is preserved."""
 
     name: str | None = None
     """A named asset or analytic shape (``styleexp-assets list``)."""
     path: str | None = None
     """A mesh file; wins over ``name``."""
     weld: float | None = None
-    """Join vertices along open edges that lie within this distance, in the file's units: 0 only
-    those at the same position; null what the file's numbers can't tell apart."""
+    """Merge vertices on open edges within this distance, in the file's units. 0: only coincident
+    ones. null: those closer than the file's numeric precision."""
     remesh: int | None = None
-    """Remesh to about this many vertices first (attributes are lost); null keeps the mesh."""
+    """Remesh to about this many vertices first (drops attributes). null: keep the mesh."""
     refine: str = "none"
-    """``auto``: edges too long for the style's relief are halved until none is left, on the smooth
-    surface through the mesh; texture coordinates, materials and colours are kept. A number: until
-    there are about so many faces. ``none``: the mesh's own vertices and faces, as in the paper."""
+    """Refine the mesh. ``auto``: split edges that are too long for the style's relief, placing new
+    vertices on a smooth surface through the mesh. Texture coordinates, materials and colours are
+    kept. A number: split until there are about this many faces. ``none``: keep the mesh as is, as
+    in the paper."""
 
 
 @dataclass
@@ -47,50 +48,52 @@ class StyleConfig:
     path: str | None = None
     """A mesh or image file; wins over ``name``."""
     scale: float = 1.0
-    """Size of the pattern on the result: 2 makes its features twice as large."""
+    """Scale of the pattern on the result: 2 doubles the size of its features."""
     scale_by: str = "area"
-    """What ``scale`` 1 means. ``area``: the result carries as many features as the style mesh, as
-    lengths go by the square root of the surface. ``frame``: both meshes fill the unit sphere, as in
-    the paper, and a picture fills the views unless ``loss.target`` is ``bank``."""
+    """Meaning of ``scale=1``. ``area``: the result has as many features as the style mesh; lengths
+    scale with the square root of the surface area. ``frame``: both meshes fill the unit sphere, as
+    in the paper, and an image fills the views unless ``loss.target=bank``."""
     direction: str = "auto"
-    """Which way the pattern's up points (``method=synthesis``). ``up``, ``x``, ``y``, ``z``: along
-    that axis wherever the surface allows it (``up`` is ``y``). ``flow``: smoothly along the form.
-    ``attribute:NAME``: along a vector that the source's file has for each vertex, as far as it lies
-    in the surface. ``auto``: ``up`` for a style with a direction, ``flow`` for one without."""
+    """Direction of the pattern's up axis (``method=synthesis``). ``up``, ``x``, ``y``, ``z``: along
+    that axis where the surface allows (``up`` is ``y``). ``flow``: smoothly along the form.
+    ``attribute:NAME``: along a per-vertex vector from the source file, projected onto the surface.
+    ``auto``: ``up`` for a directional style, else ``flow``."""
     rotation: float = 0.0
-    """Degrees by which the pattern is turned against that, counter-clockwise seen from outside."""
+    """Rotation of the pattern relative to ``direction``, in degrees, counter-clockwise seen from
+    outside."""
     mask: Any = None
-    """Where the relief goes; null is everywhere. One of these, or a list of them, multiplied:
-    ``attribute:NAME`` (a number in [0, 1] that the source's file has for each vertex),
-    ``color:CHANNEL`` (of the vertex colours: r, g, b, a or luminance), ``texture:FILE`` (a
-    picture's luminance through the source's texture coordinates, row 0 at the top, repeated),
-    ``slope:DEGREES`` (where the normal is within so many of up, +Y), ``height:LOW..HIGH`` (in
-    shares of the source's height along +Y). ``not:`` in front of one takes the rest."""
+    """Where to apply the relief; null: everywhere. One mask, or a list of masks that are
+    multiplied: ``attribute:NAME`` (a per-vertex number in [0, 1] from the source file),
+    ``color:CHANNEL`` (vertex colour channel: r, g, b, a or luminance), ``texture:FILE`` (an image's
+    luminance at the source's texture coordinates, row 0 at the top, repeated), ``slope:DEGREES``
+    (normals within this angle of up, +Y), ``height:LOW..HIGH`` (fractions of the source's height
+    along +Y). Prefix ``not:`` inverts a mask."""
     falloff: float = 0.05
-    """Width of the mask's borders, in radii of the normalised source; half of it lies on each
-    side. 0 leaves the mask as it is."""
+    """Width of the mask's soft border, in radii of the normalised source, half on each side. 0:
+    hard border."""
     relief_length: float | None = None
-    """Mesh styles (``method=synthesis``): what is smaller than this, in radii of the style, is its
-    relief, the rest its shape; null finds it."""
+    """Mesh styles (``method=synthesis``): features smaller than this, in radii of the style, are
+    relief; larger ones are shape. null: estimated."""
     kind: str = "auto"
-    """What a picture's colours are. ``photo``: its tone is height, as high as its pattern's size
-    suggests. ``height``: height in proportion, see ``image_depth``. ``normal``: the directions of a
-    tangent-space normal map, green up (OpenGL); ``normal_dx``: green down (DirectX); its height
-    follows from it, in proportion. ``auto``: a normal map where the colours are such, else
-    ``photo``; always ``photo`` for methods that compare renders with the picture's tone."""
+    """How to interpret a style image. ``photo``: tone is height; the amplitude is estimated from
+    the pattern's size. ``height``: a height map with known amplitude, see ``image_depth``.
+    ``normal``: a tangent-space normal map, green up (OpenGL); ``normal_dx``: green down (DirectX);
+    the height is integrated, with its true amplitude. ``auto``: a normal map if the colours look
+    like one, else ``photo``; always ``photo`` for methods that compare renders with the image's
+    tone."""
     invert: bool = False
-    """Turn a picture's heights over: dark is high, bumps are dents."""
+    """Invert an image's heights: dark is high, bumps become dents."""
     image_depth: float | None = None
-    """``kind=height``: how high the full range of the map's values, 0 to 1, is, in shares of the
-    picture's longer side; null is 0.1."""
+    """``kind=height``: height of the map's full range, 0 to 1, as a fraction of the image's longer
+    side. null: 0.1."""
     image_contrast: float | None = 0.15
-    """Image styles: standard deviation that the picture's tone is brought to (it sets the height of
-    the relief); null keeps the picture's own contrast."""
+    """Image styles: standard deviation the image's tone is scaled to, which sets the height of the
+    relief. null: keep the image's contrast."""
     image_match_mean: bool = True
-    """Image styles: shift the picture's mean tone to the mean of the rendered source."""
+    """Image styles: shift the image's mean tone to that of the rendered source."""
     image_tile: float = 1.0
-    """Image styles: how large the picture lies on the result, besides ``scale``. At 1 a square
-    picture has the area of the source's surface (``scale_by=area``) or of the unit sphere's."""
+    """Image styles: size of the image on the result, on top of ``scale``. At 1 a square image has
+    the area of the source's surface (``scale_by=area``) or of the unit sphere."""
 
 
 @dataclass
@@ -102,37 +105,40 @@ class FieldConfig:
     """The radius that ``sigma`` and ``bound`` are measured in: the ``style``'s, so that with
     ``style.scale_by=area`` they go with the pattern, or the ``source``'s, as in the paper."""
     sigma: float | None = None
-    """Standard deviation of the frequency matrix B (Fig. 7), in cycles per radius. null: the root
-    mean square frequency of the style mesh's relief, or of the picture's tone. The paper has 5."""
+    """Standard deviation of the frequency matrix B (Fig. 7), in cycles per radius. null: the RMS
+    frequency of the style mesh's relief, or of the image's tone. Paper: 5."""
     features: int = 128
     """Rows of B; the encoding has twice as many entries (h_f = 256)."""
     include_input: bool = False
     """Also feed the raw coordinates, as Text2Mesh does."""
     progressive: float = 0.0
-    """Open the frequency bands over this share of the run (Text2Mesh: 0.13); 0 is off."""
+    """Open the frequency bands progressively over this fraction of the run (Text2Mesh: 0.13). 0:
+    off."""
     width: int = 256
     depth: int = 8
-    """Fully connected layers, the output layer included."""
+    """Number of fully connected layers, including the output layer."""
     last_layer: str = "zero"
-    """How the output layer's weights begin. ``zero``: d is 0 at the first step. ``random``: like
-    the other layers', so that d is small noise."""
+    """Initialisation of the output layer. ``zero``: d = 0 at the first step. ``random``: like the
+    other layers, so d starts as small noise."""
     limit: str = "tanh"
-    """What keeps displacements within the bound: ``tanh``, or ``clamp``, which has no gradient at
+    """How displacements are kept within the bound: ``tanh``, or ``clamp``, which has no gradient at
     the bound."""
     bound: float | None = None
-    """Displacements lie in (-bound, bound), in radii. null: twice what the
-    style mesh's own relief needs; of a picture, which doesn't tell its height, twice 0.15 of its
-    wavelength. The paper has 0.1."""
+    """Displacements lie in (-bound, bound), in radii. null: twice the half range of the style
+    mesh's relief; for an image, whose height is unknown, twice 0.15 of its wavelength. Paper:
+    0.1."""
     start: str = "map"
-    """What the field's displacement is added to. ``map``: the style's height map, laid on by
-    triplanar projection (`styleexp.height_maps`). ``synthesis``: what ``method=synthesis`` makes.
-    ``source``: nothing, as in the paper."""
+    """Base displacement that the field adds to. ``map``: the style's height map, applied by
+    triplanar projection (`styleexp.height_maps`). ``synthesis``: the result of
+    ``method=synthesis``. ``source``: none, as in the paper."""
     learned: float = 0.25
-    """Unless ``start=source``: how much of the bound the learned part may use, 0 to 1."""
+    """Fraction of the bound available to the learned part, 0 to 1. Ignored with
+    ``start=source``."""
     zero_mean: bool = True
-    """Subtract the area-weighted mean displacement, so that the mesh can't shrink as a whole."""
+    """Subtract the area-weighted mean displacement, so that the mesh can't shrink or grow
+    overall."""
     unfold: bool = True
-    """Damp the final displacement where faces would turn over, until none does."""
+    """Damp the final displacement where faces would flip, until none do."""
 
 
 @dataclass
@@ -141,21 +147,22 @@ class LocalViewsConfig:
 
     mode: str = "surface"
     """``image``: crops of the rendered global view, as in the paper. ``zoom``: the same windows,
-    rendered anew by a zoomed camera. ``surface``: a zoomed camera aimed at a random point of the
-    surface."""
+    re-rendered with a zoomed camera. ``surface``: a zoomed camera aimed at a random surface
+    point."""
     per_view: int = 10
-    """Local views for each global view."""
+    """Local views per global view."""
     crop: str = "side"
-    """``image`` and ``zoom``: whether the paper's 10 % are of the ``side`` or of the ``area``."""
+    """``image`` and ``zoom``: whether ``share`` is a fraction of the frame's ``side`` or
+    ``area``."""
     share: float = 0.1
-    """That share."""
+    """Crop size as a fraction of the frame; see ``crop`` (paper: 10 %)."""
     size: int = 112
-    """Pixels on a side; ``image`` crops are resized to it."""
+    """Side in pixels; ``image`` crops are resized to it."""
     perspective: str = "after"
-    """``image``: whether the random perspective is drawn ``after`` the crop, for each crop anew, or
-    ``before`` it, for the view that is cropped."""
+    """``image``: apply the random perspective ``after`` cropping, drawn separately for each crop,
+    or ``before``, once to the whole view."""
     extent: float = 0.5
-    """``surface``: width of the window at the surface, in radii of the normalised mesh."""
+    """``surface``: width of the window on the surface, in radii of the normalised mesh."""
 
 
 @dataclass
@@ -174,19 +181,20 @@ class ViewsConfig:
     azimuth_std: float = 45.0
     """Standard deviations in degrees (paper: pi/4)."""
     spread: str = "around"
-    """``normal``: azimuth from the normal distribution, as in the paper. ``around``: azimuth spread
-    evenly around the object, so that its back is styled too."""
+    """``normal``: azimuth drawn from the normal distribution, as in the paper. ``around``: azimuth
+    spread evenly around the object, so that its back is stylised too."""
     perspective: float = 0.0
-    """Distortion of the random perspective (omega_global); 0 is off."""
+    """Strength of the random perspective (omega_global). 0: off."""
     perspective_probability: float = 0.8
     perspective_fill: float | None = None
-    """Grey of what a perspective brings in from outside the frame; null: the background's."""
+    """Grey level for pixels that the perspective brings in from outside the frame. null: the
+    background's."""
     local: LocalViewsConfig = option(default_factory=LocalViewsConfig)
 
 
 @dataclass
 class ShadingConfig:
-    """How the training renders look (METHOD: Text2Mesh's light)."""
+    """Appearance of the training renders. The light is Text2Mesh's."""
 
     albedo: float = 0.5
     normals: str = "smooth"
@@ -194,17 +202,17 @@ class ShadingConfig:
     background: str = "foreground"
     """``white``, ``black``, ``foreground`` (the mean grey of the rendered source) or a number."""
     outlines: bool = False
-    """Whether outlines carry gradients, where the renderer can. Off in the paper; where they do,
-    the optimiser grows knobs to make outlines inside the frame."""
+    """Propagate gradients through outlines, if the renderer can. Off in the paper; when on, the
+    optimiser grows knobs to create outlines inside the frame."""
     light_frame: str = "camera"
-    """Where the light stands still: ``camera``, as in Text2Mesh, or ``world``."""
+    """Frame the light is fixed in: ``camera``, as in Text2Mesh, or ``world``."""
     lights: int = 3
-    """1: a grey picture under one light, as in the paper. 3: besides, the same light turned by 120
-    and 240 degrees about the viewing axis, each in a colour of its own: the colour then tells the
-    normal, and bumps from dents. A picture as style is compared in grey in any case."""
+    """1: a grey render under one light, as in the paper. 3: the same light also rotated by 120 and
+    240 degrees about the viewing axis, one colour channel each, so that the colour encodes the
+    normal and distinguishes bumps from dents. Image styles are always compared in grey."""
     light_spread: float = 0.0
-    """Largest angle, in degrees, by which the light is turned at random about the viewing axis, for
-    every view anew; 0 fixes it in camera space. At 180 bumps can't be told from dents."""
+    """Maximum random rotation of the light about the viewing axis, in degrees, drawn per view. 0:
+    fixed in camera space. 180: bumps and dents become indistinguishable."""
 
 
 @dataclass
@@ -213,13 +221,14 @@ class EncoderConfig:
 
     name: str = "vgg16"
     precision: str = "auto"
-    """``auto`` (bf16 where the hardware gains from it), ``fp32`` or ``bf16``; the one chosen is in
-    the run's record."""
+    """``auto`` (bf16 where the hardware is faster with it), ``fp32`` or ``bf16``. The run's record
+    holds the choice."""
     pooling: str = "max"
     activations: str = "relu"
-    """What a layer serves: its output after the ReLU, or before it (``conv``)."""
+    """Features taken after the ReLU (``relu``) or before it (``conv``)."""
     normalisation: str = "weights"
-    """``weights``: what the weights were trained with; ``paper``: the constants of Sec. 4.1."""
+    """Input normalisation. ``weights``: the constants the weights were trained with. ``paper``:
+    those of Sec. 4.1."""
 
 
 @dataclass
@@ -232,33 +241,33 @@ class LossConfig:
     )
     """Style layers, by name or by the paper's 1-based index of VGG-19's convolutions."""
     block_weights: list[float] = option(default_factory=lambda: [0.3, 0.5, 1.0, 2.0, 2.0])
-    """A weight for the layers of each of VGG's five blocks."""
+    """One weight per VGG block, for the layers in it."""
     normalisation: str = "channels_cells"
-    """What a layer's F^T F is divided by. ``none``, as Eqs. 3 to 6 are written; ``cells``: by how
-    many cells it sums over; ``channels_cells``: besides by the channels; ``mean``: as before, and
-    the squared distance is the mean over the matrix, not its sum. With Adam, only the layers'
-    weights against each other differ."""
+    """Divisor of a layer's F^T F. ``none``: as Eqs. 3 to 6 are written. ``cells``: number of cells
+    summed over. ``channels_cells``: cells times channels. ``mean``: like ``channels_cells``, and
+    the squared distance is averaged over the matrix instead of summed. With Adam, this only changes
+    the relative weights of the layers."""
     lambda_global: float = 0.3
     lambda_local: float = 1.0
     """lambda of Eq. 7 (paper: 0.1)."""
     masked: Any = True
-    """Grams over the foreground only, divided by its area, not over the whole frame. ``pictures``:
-    only where the style is a picture, which has no background to compare with."""
+    """Compute Grams over the foreground only, divided by its area, instead of the whole frame.
+    ``pictures``: only if the style is an image, which has no background to compare with."""
     erosion: int = 2
-    """Cells taken off the mask's rim at every layer; they see the background."""
+    """Cells eroded from the mask's rim at every layer, because they see the background."""
     relative: str = "source"
-    """What each layer's squared distance is divided by: ``none``, as in the paper; ``target``, the
-    squared norm of the target; ``source``, the source mesh's own distance, so that every layer
-    starts at about 1."""
+    """Divisor of each layer's squared distance. ``none``: as in the paper. ``target``: squared norm
+    of the target. ``source``: the source mesh's own distance, so that every layer starts at about
+    1."""
     target: str = "bank"
-    """``bank``: the style's Grams are averaged once over a bank of views. ``same_views``: the style
-    mesh is rendered at the result's views in every step, as in the paper; ``own_views``: at random
-    views of its own. ``whole``: as ``same_views``, but a picture is the target of local views as a
-    whole, too, not in crops, as in Text2Mesh."""
+    """``bank``: average the style's Grams once over a bank of views. ``same_views``: render the
+    style mesh at the result's views in every step, as in the paper. ``own_views``: at independent
+    random views. ``whole``: like ``same_views``, but local views are compared with the whole style
+    image instead of crops, as in Text2Mesh."""
     bank_views: int = 24
     relief_weight: float = 1.0
-    """Weight of mean((d / r)^4), where r is half the range of the style's relief: keeps the
-    displacement from flattening out at its bound. Not in the paper."""
+    """Weight of mean((d / r)^4), where r is half the range of the style's relief. Keeps the
+    displacement from saturating at its bound. Not in the paper."""
 
 
 @dataclass
@@ -268,19 +277,18 @@ class OptimConfig:
     steps: int = 160
     rate: float = 4e-3
     schedule: str = "cosine"
-    """``step``: the rate is multiplied by ``decay`` every ``decay_every`` steps, as in the paper.
-    ``cosine``: it rises over the first tenth of the run, and falls to a twentieth over all of it,
-    so that the last steps settle."""
+    """``step``: multiply the rate by ``decay`` every ``decay_every`` steps, as in the paper.
+    ``cosine``: warm up over the first tenth of the run, then decay to a twentieth of the rate."""
     decay: float = 0.9
     decay_every: int = 100
     nominal_steps: int | None = None
-    """``step``: the length of run that ``rate`` and ``decay_every`` are meant for. A run of other
-    ``steps`` has its rate raised and its decays brought closer by the same factor, so that a short
-    run goes as far as a long one. null: taken as they are."""
+    """``step``: run length that ``rate`` and ``decay_every`` are tuned for. With other ``steps``,
+    the rate is multiplied and the decay interval divided by the same factor, so that a short run
+    gets as far as a long one. null: no rescaling."""
     seed: int = 0
     unit_gradient: bool = True
-    """Bring every step's gradient to the same length: otherwise a view that shows only a few cells
-    of a deep layer, whose Grams are mostly chance, throws the field off. Not in the paper."""
+    """Normalise the gradient's length in every step. Otherwise a view that shows only a few cells
+    of a deep layer, whose Grams are mostly noise, throws the field off. Not in the paper."""
     renormalize: bool = False
     """Fit the displaced mesh into the unit sphere in every step, as Text2Mesh does."""
     checkpoint_every: int = 25
@@ -288,30 +296,30 @@ class OptimConfig:
 
 @dataclass
 class PreviewConfig:
-    """What is drawn of the result; never seen by the optimisation."""
+    """Pictures of the result. Not used by the optimisation."""
 
     name: str = "builtin"
-    """``builtin``: preview.png and turntable.gif. ``pyrender``: besides, an independent look at the
-    result, check.png, check.gif and check.json, for which the extra ``gl`` is needed."""
+    """``builtin``: preview.png and turntable.gif. ``pyrender``: also an independent rendering of
+    the result as check.png, check.gif and check.json; needs the extra ``gl``."""
     resolution: int = 320
-    """Pixels on a side of each picture."""
+    """Side of each picture in pixels."""
     turntable_frames: int = 36
     check_resolution: int = 640
-    """``pyrender``: pixels on a side of each picture."""
+    """``pyrender``: side of each picture in pixels."""
     platform: str = "auto"
-    """``pyrender``: how it draws without a display. ``egl``, ``osmesa`` or ``auto``, EGL or else
-    OSMesa; the one used is in check.json."""
+    """``pyrender``: headless platform. ``egl``, ``osmesa`` or ``auto`` (EGL, else OSMesa).
+    check.json holds the one used."""
 
 
 @dataclass
 class MetricsConfig:
-    """How the result is measured, in metrics.json; never seen by the optimisation."""
+    """Measurement of the result, in metrics.json. Not used by the optimisation."""
 
     judge: str = "auto"
-    """The encoder that judges how near the style is: ``auto`` is one that the run doesn't train
-    with; ``none`` leaves out what needs an encoder."""
+    """Encoder that measures the distance to the style. ``auto``: one that the run doesn't train
+    with. ``none``: skip metrics that need an encoder."""
     windows: int = 32
-    """Places of the result that are looked at."""
+    """Number of surface windows that are compared."""
 
 
 @dataclass
@@ -328,22 +336,23 @@ class Config:
     shading: ShadingConfig = option(default_factory=ShadingConfig)
     loss: LossConfig = option(default_factory=LossConfig)
     baseline: Any = None
-    """A method without this package's loop of learning, such as ``synthesis``; null learns, as
-    `stylize` does. Its own options, with its registered ``name``; ``conf/method`` sets it."""
+    """A method that replaces the optimisation loop, such as ``synthesis``; null: optimise, as
+    `stylize` does. Holds the method's own options, with its registered ``name``; set by
+    ``conf/method``."""
     optim: OptimConfig = option(default_factory=OptimConfig)
     preview: PreviewConfig = option(default_factory=PreviewConfig)
     metrics: MetricsConfig = option(default_factory=MetricsConfig)
     logger: dict[str, Any] = option(default_factory=dict)
-    """Who else is told of the run's numbers and pictures: each logger's own options, by its name.
-    ``logger=tensorboard``, ``logger=mlflow`` or ``'logger=[tensorboard,mlflow]'``."""
+    """Loggers that receive the run's numbers and pictures: each logger's options, keyed by its
+    name. ``logger=tensorboard``, ``logger=mlflow`` or ``'logger=[tensorboard,mlflow]'``."""
     report: bool = True
-    """Write ``report.html``, the run's page: about 3 MB and a second for 20 000 faces."""
+    """Write the run's page, ``report.html``: about 3 MB and 1 s for 20 000 faces."""
     strength: float = 1.0
-    """Factor on the final displacement; 0 gives the source back."""
+    """Factor on the final displacement; 0 returns the source unchanged."""
     device: str = "auto"
-    """``auto`` (cuda where there is one), ``cpu``, ``cuda`` or ``cuda:N``."""
+    """``auto`` (CUDA if available), ``cpu``, ``cuda`` or ``cuda:N``."""
     threads: int = 0
-    """CPU threads for torch; 0 takes all cores."""
+    """CPU threads for torch; 0: all cores."""
     debug: bool = False
     """Show tracebacks of user errors."""
 
@@ -425,7 +434,7 @@ BETWEEN = {
 
 
 def check(config: Config) -> None:
-    """Raise `UserError` for a value that has no meaning, naming its key and what is allowed."""
+    """Raise `UserError` for an invalid value, naming its key and the allowed values."""
     for key, allowed in CHOICES.items():
         if _value(config, key) not in allowed:
             raise unknown_name(f"value for {key}", str(_value(config, key)), map(str, allowed))
@@ -448,8 +457,8 @@ def check(config: Config) -> None:
     refine = config.source.refine
     if refine not in ("none", "auto") and not re.fullmatch(r"[1-9]\d{2,6}", refine):
         raise UserError(
-            f"source.refine={refine} is not allowed: give auto, none or how many faces it should "
-            "have, from 100 to 9999999."
+            f"source.refine={refine} is not allowed: give auto, none or a number of faces from 100 "
+            "to 9999999."
         )
     background = config.shading.background
     if background not in ("white", "black", "foreground"):
@@ -465,11 +474,12 @@ def check(config: Config) -> None:
 
 
 DIRECTIONS = ("auto", "up", "flow", "x", "y", "z")
-"""Of ``style.direction``, besides ``attribute:NAME``."""
+"""Values of ``style.direction``, besides ``attribute:NAME``."""
 
 
 def _check_placing(config: Config) -> None:
-    """The same for where the relief goes, and which way."""
+    """Raise `UserError` for invalid options of where and in which direction the relief is
+    applied."""
     from styleexp import masks
 
     style, method = config.style, getattr(config.baseline, "name", None)
@@ -485,18 +495,18 @@ def _check_placing(config: Config) -> None:
             if (value := getattr(style, key)) != plain:
                 raise UserError(
                     f"style.{key}={value} needs method=synthesis or "
-                    "field.start=synthesis: nothing else reads it."
+                    "field.start=synthesis: no other method reads it."
                 )
     if method is None and (style.invert or style.kind not in ("auto", "photo")):
         given = "style.invert=true" if style.invert else f"style.kind={style.kind}"
         raise UserError(
-            f"{given} is about heights, and this method compares renders with the picture's tone: "
+            f"{given} describes heights, but this method compares renders with the picture's tone: "
             "add method=synthesis or method=displacement_map."
         )
     terms = masks.parsed(style.mask)
     if terms and method == "geometric_textures":
         raise UserError(
-            "method=geometric_textures gives the result faces of its own, and style.mask is of the "
+            "method=geometric_textures remeshes the result, and style.mask is defined on the "
             "source's vertices: choose another method, or leave style.mask out."
         )
     lost = [f"style.mask={term.text}" for term in terms if term.kind in masks.OF_THE_FILE]
@@ -509,7 +519,7 @@ def _check_placing(config: Config) -> None:
 
 
 def _numbers(part: Any, prefix: str = "") -> Iterator[tuple[str, float]]:
-    """Every number of a configuration, with its key."""
+    """Yield every number of a configuration with its key."""
     if isinstance(part, int | float):
         yield prefix, part
     elif isinstance(part, list):

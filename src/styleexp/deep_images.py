@@ -1,7 +1,7 @@
-"""Pictures with more than eight bits a colour, of which Pillow would drop the lower ones.
+"""Read images with more than eight bits per channel, which Pillow would truncate to eight.
 
-PNG is decoded by imagecodecs, TIFF by tifffile (which needs it for compressed ones); both are
-loaded when such a picture comes.
+PNG is decoded by imagecodecs, TIFF by tifffile (which needs imagecodecs for compressed files). Both
+are imported lazily.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
 
 PNG, TIFF = b"\x89PNG\r\n\x1a\n", (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 ASSOCIATED = 1
-"""An extra sample that the colours were multiplied by (TIFF 6.0, section 18)."""
+"""Extra sample type of premultiplied alpha (TIFF 6.0, section 18)."""
 
 
 def is_png(head: bytes) -> bool:
-    """Whether a file that begins so is a PNG of 16 bits with colours or opacity."""
+    """Whether a file with this header is a 16-bit PNG with colours or opacity."""
     return head.startswith(PNG) and head[24:25] == b"\x10" and head[25:26] in b"\2\4\6"
 
 
 def is_tiff(head: bytes) -> bool:
-    """Whether a file that begins so is a TIFF."""
+    """Whether a file with this header is a TIFF."""
     return head.startswith(TIFF)
 
 
 def read_png(path: Path, background: float, turn: int) -> Float[np.ndarray, "height width 3"]:
-    """A 16-bit PNG as float32 RGB in [0, 1] over a grey; ``turn`` is its EXIF orientation."""
+    """Read a 16-bit PNG as float32 RGB in [0, 1] over a grey; ``turn`` is its EXIF orientation."""
     import imagecodecs
 
     values = imagecodecs.png_decode(path.read_bytes())
@@ -42,11 +42,11 @@ def read_png(path: Path, background: float, turn: int) -> Float[np.ndarray, "hei
 def read_tiff(
     path: Path, background: float, most: int | None, least: int
 ) -> tuple[Float[np.ndarray, "height width 3"], int] | None:
-    """A TIFF's first page as float32 RGB in [0, 1] over a grey, and the number of its pages.
+    """Read a TIFF's first page as float32 RGB in [0, 1] over a grey, and its number of pages.
 
-    None where its colours have eight bits or fewer, or another meaning than grey, RGB and CMYK:
-    Pillow knows those. Raises `UserError` for pages of more than ``most`` pixels or a side under
-    ``least``, and for numbers outside [0, 1] or of more than 16 bits.
+    Returns None for up to eight bits per channel and for colour spaces other than grey, RGB and
+    CMYK, which are left to Pillow. Raises `UserError` for pages with more than ``most`` pixels or a
+    side under ``least``, and for values outside [0, 1] or integers of more than 16 bits.
     """
     import tifffile
 
@@ -59,15 +59,15 @@ def read_tiff(
             return None
         if most and page.imagewidth * page.imagelength > most:
             raise UserError(
-                f"the image '{path}' has more than {most} pixels; "
-                "scale it down first, a few thousand on a side are plenty."
+                f"the image '{path}' has more than {most} pixels; scale it down (a few thousand "
+                "per side are plenty)."
             )
         if min(page.imagewidth, page.imagelength) < least:
             raise UserError(
                 f"the image '{path}' is {page.imagewidth}x{page.imagelength} pixels; "
                 f"it needs at least {least} on each side."
             )
-        # Volumes and the like are pages of depth: the first is taken.
+        # For volumes and the like, use the first slice.
         values = page.asarray()
         axes = page.axes
         if "S" in axes:
@@ -84,8 +84,8 @@ def read_tiff(
         wrong = kind.kind != "u" or bits > 16
     if wrong:
         raise UserError(
-            f"the image '{path}' has values outside [0, 1], or integers of more than 16 bits or "
-            "with a sign; save it with 8 or 16 bits per channel."
+            f"the image '{path}' has values outside [0, 1], or signed integers or integers of more "
+            "than 16 bits; save it with 8 or 16 bits per channel."
         )
     values = values.astype(np.float32) / np.float32(top)
     values = values[..., None] if values.ndim == 2 else values
@@ -102,7 +102,8 @@ def read_tiff(
 
 
 def _over(values: np.ndarray, background: float, multiplied: bool = False) -> np.ndarray:
-    """Grey or RGB, with or without opacity, (height, width[, 1 to 4]), as RGB over a grey."""
+    """Composite grey or RGB, with or without alpha, (height, width[, 1 to 4]), as RGB over a
+    grey."""
     values = values[..., None] if values.ndim == 2 else values
     rgb, alpha = values, None
     if values.shape[-1] in (2, 4):
@@ -114,7 +115,7 @@ def _over(values: np.ndarray, background: float, multiplied: bool = False) -> np
 
 
 def _oriented(rgb: np.ndarray, turn: int) -> np.ndarray:
-    """Row 0 at the top, from EXIF's and TIFF's orientations 1 to 8."""
+    """Apply EXIF or TIFF orientation 1 to 8, so that row 0 is at the top."""
     if turn in (5, 6, 7, 8):
         rgb = rgb.swapaxes(0, 1)
     if turn in (3, 4, 7, 8):

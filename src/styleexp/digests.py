@@ -1,4 +1,4 @@
-"""Digests of named tensors: safetensors files hold none of their own."""
+"""Digests of named tensors; safetensors files have no checksum of their own."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 
 
 def of(tensors: Mapping[str, Any], about: str = "") -> str:
-    """sha256, as hex, of numpy arrays or torch tensors with their names and shapes, in the order of
-    their names, and of what else is told ``about`` them."""
+    """SHA-256, as hex, of NumPy arrays or torch tensors with their names and shapes, sorted by
+    name, and of the text ``about``."""
     digest = hashlib.sha256(about.encode())
     for name in sorted(tensors):
         digest.update(f"{name}{tuple(tensors[name].shape)}".encode())

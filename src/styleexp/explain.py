@@ -1,4 +1,4 @@
-"""What Hydra and OmegaConf complain about, in one sentence of ours."""
+"""Translate Hydra and OmegaConf errors into one-sentence messages."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import difflib
 import re
 
 UNKNOWN_CHOICE = r"Could not find '([\w/]+)/([^'/]+)'"
-"""Hydra's words for a name that it has no option for."""
+"""Hydra's message for an unknown option name."""
 HYDRA_PLUGINS = {"hydra/launcher": "sweep", "hydra/sweeper": "search"}
-"""Choices that Hydra's plugins bring, and the extra that installs those."""
+"""Config groups provided by Hydra plugins, and the extra that installs them."""
 
 
 def explain_plugin(error: BaseException) -> None:
-    """Raise the `UserError` of a plugin that was chosen and can't be used, if that's the matter."""
+    """Raise the `UserError` of a chosen plugin that can't be used, if that caused ``error``."""
     from styleexp import plugins
 
     choice = re.search(UNKNOWN_CHOICE, str(error))
@@ -21,7 +21,7 @@ def explain_plugin(error: BaseException) -> None:
 
 
 def explain(error: BaseException) -> str:
-    """Hydra's complaint as one or two sentences, with the nearest known name."""
+    """Hydra's error as one or two sentences, with the closest known name."""
     text = str(error)
     while error.__cause__ is not None:  # Hydra wraps OmegaConf's, which says more
         error = error.__cause__

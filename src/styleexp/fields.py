@@ -17,14 +17,14 @@ if TYPE_CHECKING:
     from styleexp.config import FieldConfig
 
 REMEMBERED = 1 << 25
-"""Most numbers of an encoding that are kept for the next step: 128 MB."""
+"""Maximum number of elements of a cached encoding, 128 MB."""
 
 
 class FourierFeatures(nn.Module):
     """Random Fourier features, gamma(v) = [cos 2 pi B v, sin 2 pi B v] (Eq. 1).
 
     B is (features, 3) with entries from N(0, sigma^2), frozen. Its rows are sorted by norm, so that
-    opening the bands progressively goes from low to high frequencies.
+    progressive opening goes from low to high frequencies.
     """
 
     frequencies: Tensor
@@ -43,7 +43,7 @@ class FourierFeatures(nn.Module):
     def forward(
         self, points: Float[Tensor, "vertices 3"], opened: float = 1.0
     ) -> Float[Tensor, "vertices size"]:
-        """Encode points; ``opened`` in [0, 1] is the share of bands that are let through."""
+        """Encode points; ``opened`` in [0, 1] is the fraction of bands that pass."""
         # A run encodes the same points in every step.
         frequencies = self.frequencies
         key = (id(points), points._version, id(frequencies), frequencies._version, opened)
@@ -55,20 +55,25 @@ class FourierFeatures(nn.Module):
             encoded = torch.cat([points, *bands] if self.include_input else bands, dim=1)
             if points.requires_grad or encoded.numel() > REMEMBERED:
                 return encoded
-            self._known = (key, points, frequencies, encoded)  # held, so that no other has their id
+            self._known = (
+                key,
+                points,
+                frequencies,
+                encoded,
+            )  # keep references, so that their ids stay unique
         return self._known[3]
 
 
 class DisplacementField(nn.Module):
-    """MLP from a position to its displacement along the normal, in (-bound, bound).
+    """MLP that maps a position to its displacement along the normal, in (-bound, bound).
 
-    The last layer starts at zero, so that the generated mesh is the source mesh at step 0, unless
+    The last layer starts at zero, so that the generated mesh equals the source at step 0, unless
     ``last_layer`` is ``random``. ``sigma`` is in cycles per radius of the normalised source,
-    ``bound`` in such radii.
+    ``bound`` in radii.
 
-    With ``zero_mean`` the mean over the vertices is taken off before the ``limit``, too: no loss
-    holds it, since the mean displacement is taken off as well, and where it drifts, the limit holds
-    every vertex and nothing is learned any more.
+    With ``zero_mean`` the mean over the vertices is subtracted before the ``limit``, too. No loss
+    constrains it, since the mean displacement is also subtracted; if it drifted, every vertex would
+    saturate at the limit and learning would stop.
     """
 
     def __init__(self, config: FieldConfig, generator: torch.Generator, sigma: float, bound: float):
@@ -78,7 +83,7 @@ class DisplacementField(nn.Module):
         self.encode = FourierFeatures(config.features, sigma, config.include_input, generator)
         sizes = [self.encode.size] + [config.width] * (config.depth - 1) + [1]
         linears = [nn.Linear(a, b) for a, b in itertools.pairwise(sizes)]
-        for layer in linears:  # torch's default initialisation, from our own generator
+        for layer in linears:  # torch's default initialisation, with our generator
             span = 1 / math.sqrt(layer.in_features)
             nn.init.uniform_(layer.weight, -span, span, generator=generator)
             nn.init.uniform_(layer.bias, -span, span, generator=generator)
@@ -92,11 +97,11 @@ class DisplacementField(nn.Module):
     def forward(
         self, encoded: Float[Tensor, "vertices size"], precision: torch.dtype = torch.float32
     ) -> Float[Tensor, " vertices"]:
-        """Displacement for each row of ``encode(points)``, all vertices at once, in radii of the
-        normalised source.
+        """Displacement for each row of ``encode(points)``, in radii of the normalised source. Takes
+        all vertices at once.
 
-        Hidden layers run in ``precision``; the last one always in float32, because neighbouring
-        displacements differ by less than bfloat16 resolves.
+        Hidden layers run in ``precision``; the last one always runs in float32, because
+        neighbouring displacements differ by less than bfloat16 can resolve.
         """
         x = encoded.to(precision)
         fused = x.device.type == "cpu" and torch.backends.mkldnn.is_available()
@@ -114,7 +119,7 @@ class DisplacementField(nn.Module):
 
 
 class _LinearRelu(torch.autograd.Function):
-    """A layer and its ReLU, one pass over the memory forward and one array less backward."""
+    """Fused linear layer and ReLU: one memory pass forward, one saved array less backward."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
@@ -132,10 +137,10 @@ class _LinearRelu(torch.autograd.Function):
 
 
 class VertexField(nn.Module):
-    """A free displacement for each vertex, in (-bound, bound): what is left without the network.
+    """A free displacement per vertex, in (-bound, bound): the field without the network.
 
-    Zero at the start. The number of vertices is known when ``encode`` is first called; only then
-    can an optimiser be given the parameter.
+    Starts at zero. The number of vertices is set by the first call of ``encode``; create the
+    optimiser after it.
     """
 
     latent: nn.Parameter
@@ -148,7 +153,7 @@ class VertexField(nn.Module):
     def encode(
         self, points: Float[Tensor, "vertices 3"], opened: float = 1.0
     ) -> Float[Tensor, "vertices 3"]:
-        """The points as they are; ``opened`` means nothing here."""
+        """Return the points unchanged; ``opened`` is ignored."""
         if isinstance(self.latent, nn.UninitializedParameter):
             self.latent.materialize((len(points),), device=points.device)
             nn.init.zeros_(self.latent)
@@ -157,16 +162,18 @@ class VertexField(nn.Module):
     def forward(
         self, encoded: Float[Tensor, "vertices 3"], precision: torch.dtype = torch.float32
     ) -> Float[Tensor, " vertices"]:
-        """Displacement of each vertex, in radii of the normalised source."""
+        """Displacement per vertex, in radii of the normalised source."""
         if len(encoded) != len(self.latent):
-            raise ValueError(f"{len(self.latent)} vertices have a displacement, not {len(encoded)}")
+            raise ValueError(
+                f"the field has {len(self.latent)} vertices, got {len(encoded)} points"
+            )
         return self.bound * torch.tanh(self.latent)
 
 
 def zero_mean(
     displacement: Float[Tensor, " vertices"], areas: Float[Tensor, " vertices"], bound: float
 ) -> Float[Tensor, " vertices"]:
-    """Subtract the area-weighted mean, so that the mesh neither grows nor shrinks as a whole, and
-    keep the bound."""
+    """Subtract the area-weighted mean, so that the mesh neither grows nor shrinks overall, and stay
+    within the bound."""
     mean = (displacement * areas).sum() / areas.sum()
     return (displacement - mean).clamp(-bound, bound)

@@ -1,4 +1,4 @@
-"""Small differentiable quantities of triangle meshes."""
+"""Differentiable quantities of triangle meshes."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class Surface:
     vertices: Float[Tensor, "vertices 3"]
     faces: Int[Tensor, "faces 3"]
     normals: Float[Tensor, "vertices 3"]
-    """Unit, area-weighted."""
+    """Unit vertex normals, area-weighted."""
 
 
 def vertex_areas(surface: Surface) -> Float[Tensor, " vertices"]:
-    """A third of the area of the faces around each vertex."""
+    """A third of the area of the adjacent faces, per vertex."""
     a, b, c = (surface.vertices[surface.faces[:, i]] for i in range(3))
     areas = torch.linalg.cross(b - a, c - a).norm(dim=1) / 6
     total = surface.vertices.new_zeros(len(surface.vertices))
@@ -31,19 +31,20 @@ def vertex_areas(surface: Surface) -> Float[Tensor, " vertices"]:
 
 
 STEEPEST = 0.02
-"""Cosine between a face before and after; below it, the face counts as turned over."""
+"""Cosine between a face's normals before and after, below which it counts as flipped."""
 
 DAMPING = 0.2
-"""How much of the displacement a round of `unfolded` takes off where faces turned over."""
+"""Fraction of the displacement that each iteration of `unfolded` removes at flipped faces."""
 
 
 def unfolded(
     surface: Surface, displacement: Float[Tensor, " vertices"]
 ) -> Float[Tensor, " vertices"]:
-    """The displacement along the normals, damped where faces would turn over, until none does.
+    """Damp the displacement along the normals where faces would flip, until none do.
 
-    At creases and thin parts neighbouring normals cross within the displacement's reach. Vertices
-    of turned faces are damped in rounds, their neighbours in proportion to how many of theirs are.
+    At creases and thin parts, neighbouring normals cross within the displacement's range. Vertices
+    of flipped faces are damped iteratively, and their neighbours in proportion to their share of
+    damped neighbours.
     """
     faces, dtype = surface.faces, displacement.dtype
     vertices, normals = surface.vertices.to(dtype), surface.normals.to(dtype)
@@ -52,7 +53,7 @@ def unfolded(
     zeros = displacement.new_zeros(len(vertices))
     degree = zeros.index_add(0, both, torch.ones_like(both, dtype=dtype)).clamp(min=1)
     before = _face_normals(vertices, faces)
-    for _ in range(100):  # then next to nothing is left there
+    for _ in range(100):  # almost nothing is left after that
         after = _face_normals(vertices + displacement[:, None] * normals, faces)
         turned = (before * after).sum(1) < STEEPEST * before.norm(dim=1) * after.norm(dim=1)
         if not bool(turned.any()):
@@ -66,7 +67,7 @@ def unfolded(
 def _face_normals(
     vertices: Float[Tensor, "vertices 3"], faces: Int[Tensor, "faces 3"]
 ) -> Float[Tensor, "faces 3"]:
-    """Twice the area long."""
+    """Face normals, of length twice the area."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return torch.linalg.cross(b - a, c - a)
 
@@ -74,7 +75,7 @@ def _face_normals(
 def sample_surface(
     surface: Surface, count: int, generator: torch.Generator
 ) -> tuple[Float[Tensor, "count 3"], Float[Tensor, "count 3"]]:
-    """Points spread evenly over the surface, with their interpolated unit normals."""
+    """Sample points uniformly on the surface, with interpolated unit normals."""
     corners = surface.vertices[surface.faces]
     areas = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     weights = areas.norm(dim=1).cpu().double()

@@ -1,9 +1,9 @@
-"""The style as a height map laid on the source by triplanar projection.
+"""The style as a height map, applied to the source by triplanar projection.
 
-The map is a picture's heights (`styleexp.pictures`), or a patch of the style mesh's own relief. It
-is projected along the three axes, tiled by mirroring, and the three heights are blended by the
-components of the vertex normal. No view is rendered, nothing is learned: what a technical artist
-would do, in an instant. It is where the field starts (`field.start`), and a baseline.
+The map comes from an image (`styleexp.pictures`), or from a patch of the style mesh's relief. It is
+projected along the three axes, tiled by mirroring, and blended by the components of the vertex
+normal. Nothing is rendered or learned, so it is instant: what a technical artist would do. It is
+the default start of the field (`field.start`), and a baseline.
 """
 
 from __future__ import annotations
@@ -29,32 +29,32 @@ if TYPE_CHECKING:
     from styleexp.scene import Subject
 
 AXES = ((2, 1), (0, 2), (0, 1))
-"""The map's right and up, as axes of the source, for the projections along x, y and z."""
+"""Source axes of the map's right and up, for the projections along x, y and z."""
 
 SAMPLED = 40_000
-"""At most so many of the style's vertices are looked at to find its patch."""
+"""Maximum number of style vertices considered when choosing the patch."""
 
 PATCH_DETAIL = 256
-"""Pixels on a side of the height map of a style mesh."""
+"""Side, in pixels, of a style mesh's height map."""
 
 PATCH = 0.6
-"""Radius of the patch that a style mesh's height map is taken from, in the style's radii."""
+"""Radius of the patch that a style mesh's height map is taken from, in radii of the style."""
 
 SHARPNESS = 8.0
-"""Power of the normal's components by which the three projections are blended."""
+"""Exponent of the normal's components in the blend of the three projections."""
 
 RELIEF_LENGTH = 0.5
-"""What is larger than this, in radii of the style, is its shape, not its relief."""
+"""Length, in radii of the style, above which features count as shape, not relief."""
 
 
 class NoPatch(UserError):
-    """The style mesh has nowhere enough vertices side by side for a height map."""
+    """No region of the style mesh is dense enough for a height map."""
 
 
 @dataclass(frozen=True)
 class HeightMap:
-    """One tile, row 0 at the top, its mean 0, its half range 1 (of a picture whose heights are in
-    proportion before detail was filtered out)."""
+    """One tile, row 0 at the top, with mean 0 and half range 1 (for images with a known amplitude,
+    before fine detail was filtered out)."""
 
     height: Float[Tensor, "rows columns"]
     side: float
@@ -64,11 +64,11 @@ class HeightMap:
 def displacement(
     scene: Subject, height: float | None = None, patch: float = PATCH, sharpness: float = SHARPNESS
 ) -> Float[Tensor, " vertices"]:
-    """The style's height map as a displacement of the source's vertices, zero on average over the
-    surface (where there is a mask, over what it selects), in radii of the normalised source. The
-    mask is not applied yet.
+    """The style's height map as a displacement of the source's vertices, in radii of the normalised
+    source. Its area-weighted mean over the surface (over the masked part, if there is a mask) is
+    zero. The mask is not applied yet.
 
-    ``height`` is half its range; the style's own relief's where none is given.
+    ``height`` is half its range; defaults to that of the style's own relief.
     """
     tile, surface = height_map(scene, patch), scene.surface
     raised = triplanar(tile, surface.vertices, surface.normals, sharpness)
@@ -77,7 +77,7 @@ def displacement(
 
 
 def height_map(scene: Subject, patch: float) -> HeightMap:
-    """The style as a height map of the size that ``style.scale`` and ``style.image_tile`` say."""
+    """The style as a height map, sized by ``style.scale`` and ``style.image_tile``."""
     style, device = scene.style, scene.surface.vertices.device
     heights = scene.heights
     if heights is not None:
@@ -87,27 +87,27 @@ def height_map(scene: Subject, patch: float) -> HeightMap:
         assert isinstance(style, meshes.Mesh)
         height = torch.from_numpy(mesh_patch(style, patch)).to(device)
         side = patch * math.sqrt(2) * scene.unit
-    # Detail finer than the source's edges would come out as noise.
+    # Detail finer than the source's edges would alias to noise.
     edge = meshes.mean_edge_length(scene.source.vertices, scene.source.faces) / scene.frame.scale
     fit = styles.resized(height, min(side / edge, max(height.shape)))
     if heights is not None and heights.in_proportion:
-        half = pictures.spread(heights.height)  # of the whole: what was filtered out stays lost
+        half = pictures.spread(heights.height)  # before filtering, so the amplitude is unchanged
     else:
         half = max(half_range(fit.cpu().numpy().ravel()), 1e-6)
     return HeightMap((fit - fit.mean()) / half, side)
 
 
 def picture_side(config: Config, unit: float) -> float:
-    """Length of a style picture's longer side on the result, in radii of the normalised source."""
+    """Length of a style image's longer side on the result, in radii of the normalised source."""
     return unit * config.style.image_tile * math.sqrt(4 * math.pi)
 
 
 def mesh_patch(style: meshes.Mesh, radius: float) -> Float[np.ndarray, "side side"]:
-    """The relief of a style mesh over the square inside a disc of ``radius`` radii, seen from
-    straight above, y up.
+    """Relief of a style mesh over the square inscribed in a disc of ``radius`` radii, seen along
+    its normal, y up.
 
-    The height is `shapes.relief` for an analytic style, `relief.mesh_relief` for any other. The
-    disc lies where the mesh is flattest and steepest, so that its patterns keep what is up.
+    The height is `shapes.relief` for an analytic style, else `relief.mesh_relief`. The disc is
+    placed where the mesh is flattest and most upright, so that patterns keep their up direction.
     """
     from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
     from scipy.spatial import cKDTree
@@ -119,7 +119,7 @@ def mesh_patch(style: meshes.Mesh, radius: float) -> Float[np.ndarray, "side sid
     else:
         height = mesh_relief(vertices, style.faces, normals, RELIEF_LENGTH)
 
-    # Candidates spread over the mesh; around each, how well the normals agree.
+    # Candidates spread over the mesh, scored by how well the normals around them agree.
     seeds = spread(len(vertices), 500)
     some = np.union1d(seeds, spread(len(vertices), SAMPLED))
     around = cKDTree(vertices[some]).query_ball_point(vertices[seeds], radius)
@@ -133,7 +133,7 @@ def mesh_patch(style: meshes.Mesh, radius: float) -> Float[np.ndarray, "side sid
     up = up - (up @ out) * out
     up /= np.linalg.norm(up)
     right = np.cross(up, out)
-    # A little more than the square, for the interpolation at its border; the near side alone.
+    # Slightly more than the square, for interpolation at its border; near side only.
     offset = vertices - vertices[seeds[best]]
     plane = np.stack([offset @ right, offset @ up], axis=1)
     half = radius / math.sqrt(2)
@@ -142,7 +142,7 @@ def mesh_patch(style: meshes.Mesh, radius: float) -> Float[np.ndarray, "side sid
     if seen.sum() < 16 or np.linalg.matrix_rank(plane[seen] - plane[seen][0], tol=1e-6) < 2:
         raise NoPatch(
             f"the style '{style.name}' has no patch of {radius} radii to take a height map from: "
-            "give a larger baseline.patch, or a style with more vertices."
+            "increase baseline.patch, or use a style with more vertices."
         )
     across = (np.arange(PATCH_DETAIL) + 0.5) / PATCH_DETAIL * 2 - 1
     x, y = np.meshgrid(half * across, -half * across)
@@ -152,7 +152,7 @@ def mesh_patch(style: meshes.Mesh, radius: float) -> Float[np.ndarray, "side sid
 
 
 def spread(count: int, most: int) -> Int[np.ndarray, " some"]:
-    """At most ``most`` of the indices below ``count``, evenly spread."""
+    """Up to ``most`` evenly spaced indices below ``count``."""
     return np.linspace(0, count - 1, min(count, most)).astype(int)
 
 
@@ -162,7 +162,7 @@ def triplanar(
     normals: Float[Tensor, "points 3"],
     sharpness: float,
 ) -> Float[Tensor, " points"]:
-    """Height at points of a surface: the tile projected along x, y and z, blended by the normal.
+    """Height at surface points: the tile projected along x, y and z, blended by the normal.
 
     A tile has a corner at the origin, and its neighbours are its mirror images.
     """

@@ -1,7 +1,7 @@
-"""Which run a folder holds: a run is known by its key, never by where its folder lies.
+"""Identify the run in a folder by its key, never by the folder's location.
 
-The key is a hash of what a result follows from. A job of a sweep or a plan takes state and numbers
-only from a record with its own key; `not_of` says what else a folder holds.
+The key is a hash of everything that determines a result. A job of a sweep or plan reads state and
+numbers only from a record with its own key; `not_of` explains a mismatch.
 """
 
 from __future__ import annotations
@@ -19,31 +19,31 @@ if TYPE_CHECKING:
     from styleexp.config import Config
 
 FILES = ("source", "style")
-"""Parts of the configuration that may name a file."""
+"""Configuration sections that may name a file."""
 
 
 @dataclass(frozen=True)
 class Named:
-    """What may be a file of a run: `FILES`, or a picture of ``style.mask``."""
+    """A possible file of a run: one of `FILES`, or an image in ``style.mask``."""
 
     name: str | None
     path: str | None
 
 
 ABSENT = "not found"
-"""In the place of a file's sha256."""
+"""Placeholder for the sha256 of a missing file."""
 
 
 def essence(config: Mapping[str, Any]) -> Any:
-    """A run's configuration as plain JSON, without what its result doesn't follow from."""
+    """A run's configuration as plain JSON, without keys that don't affect the result."""
     aside = ("threads", "debug", "logger", "report")
     kept = {key: value for key, value in config.items() if key not in aside}
     return json.loads(json.dumps(kept, default=str))
 
 
 def job_key(config: Config) -> str:
-    """Hash of what a run's result follows from: its resolved configuration, this version, and the
-    content of the files of its source and style."""
+    """Hash of everything that determines a run's result: its resolved configuration, this package's
+    version, and the content of its source and style files."""
     from styleexp import __version__, sources
     from styleexp.errors import UserError
 
@@ -52,14 +52,14 @@ def job_key(config: Config) -> str:
         try:
             path = sources.locate(kind, part.name, part.path)
             files[kind] = sha256(path) if path else None
-        except UserError:  # the run will say so
+        except UserError:  # the run reports it
             files[kind] = ABSENT
     return _hash(asdict(config), files, __version__)
 
 
 def parts(config: Config) -> dict[str, Named]:
-    """All of a run that may be a file, by the words for it: ``source``, ``style`` and, as often as
-    ``style.mask`` has a picture, ``mask``, ``mask 2`` and so on."""
+    """Possible files of a run, keyed ``source``, ``style`` and, for each image in ``style.mask``,
+    ``mask``, ``mask 2`` and so on."""
     from styleexp import masks
 
     found = {kind: Named(getattr(config, kind).name, getattr(config, kind).path) for kind in FILES}
@@ -69,7 +69,7 @@ def parts(config: Config) -> dict[str, Named]:
 
 
 def of(record: Mapping[str, Any]) -> str | None:
-    """The key of a recorded run; None where the record, of an earlier version, doesn't tell."""
+    """Key of a recorded run; None for records of earlier versions that lack it."""
     if isinstance(told := record.get("key"), str):
         return told
     try:
@@ -80,12 +80,12 @@ def of(record: Mapping[str, Any]) -> str | None:
 
 
 def not_of(key: str | None, overrides: Sequence[str], record: Mapping[str, Any]) -> str | None:
-    """Why a record is not that of the job with this key; None where it is.
+    """Why a record doesn't belong to the job with this key; None if it does.
 
-    Without a key, as in sweeps of earlier versions, the job is known by its overrides.
+    Without a key, as in sweeps of earlier versions, the job is matched by its overrides.
     """
     if key and of(record) is None and "assets" not in record:
-        return None  # an earlier version's, which ended before it had read a file or had numbers
+        return None  # of an earlier version, ended before it read files or had numbers
     theirs = record.get("overrides")
     theirs = list(map(str, theirs)) if isinstance(theirs, list) else []
     if (of(record) == key) if key else (theirs == list(overrides)):
@@ -102,8 +102,8 @@ def _hash(config: Mapping[str, Any], files: Mapping[str, str | None], version: s
 
 
 def sha256(path: Path) -> str:
-    """The sha256 of a file, `ABSENT` where there is none; of a ``.gltf`` with buffers beside it,
-    where its geometry lies, that of all their sha256."""
+    """SHA-256 of a file, or `ABSENT`. For a ``.gltf`` with external buffers, which hold the
+    geometry, the hash of all their hashes."""
     found = [_of_file(path), *map(_of_file, _buffers(path))]
     return found[0] if len(found) == 1 else hashlib.sha256("".join(found).encode()).hexdigest()
 
@@ -119,7 +119,7 @@ def _buffers(path: Path) -> list[Path]:
         found = [references.find(name, path.parent, path.parent)[0] for name in names
                  if not name.startswith("data:")]  # fmt: skip
     except (OSError, ValueError, RecursionError, TypeError, AttributeError):
-        return []  # it can't be read as a mesh, either
+        return []  # it can't be read as a mesh either
     return [each for each in found if each is not None]
 
 
@@ -133,7 +133,7 @@ def _of_file(path: Path) -> str:
 
 @lru_cache(maxsize=4096)
 def _read(path: Path, *version: int) -> str:
-    """The sha256 of a file, read once for each ``version`` of it."""
+    """SHA-256 of a file, cached per ``version``."""
     from styleexp import assets
 
     return assets.sha256(path) if path.is_file() else ABSENT

@@ -1,4 +1,4 @@
-"""Pictures in: any common raster file as RGB floats, or one sentence on what is wrong with it."""
+"""Load common raster images as RGB floats, with one-sentence errors for bad files."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ if TYPE_CHECKING:
     Array = TypeVar("Array", np.ndarray, Tensor)
 
 MIN_SIDE = 16
-"""Pixels: the deepest style layer has one cell per 16 pixels."""
+"""Minimum side in pixels: the deepest style layer has one cell per 16 pixels."""
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "GIF", "BMP", "PPM", "JPEG2000", "AVIF")
-"""Raster formats only: for EPS and the like Pillow would start other programs."""
+"""Accepted raster formats. Others, such as EPS, would make Pillow start external programs."""
 TEXTURE_FORMATS = (*FORMATS, "TGA", "DDS", "MPO")
 
 
 def load_image(path: str | Path, *, background: float = 1.0) -> Float[np.ndarray, "height width 3"]:
     """Read a picture as float32 RGB in [0, 1], row 0 at the top.
 
-    PNG, JPEG, WebP, TIFF and others (:data:`FORMATS`): colour, grey, palette, CMYK, with and
-    without opacity; PNG and TIFF with all of their 16 bits (scaled by 65535), TIFF of half, single
-    and double precision within [0, 1]. The EXIF rotation is applied, an animation gives its first
-    frame. Values are as stored (sRGB-coded); colour profiles are not applied.
+    Supports PNG, JPEG, WebP, TIFF and others (:data:`FORMATS`) in colour, grey, palette or CMYK,
+    with or without alpha; 16-bit PNG and TIFF at full depth (scaled by 65535); and half, single and
+    double precision TIFF within [0, 1]. The EXIF rotation is applied. Animations return their first
+    frame. Values are as stored (sRGB-encoded); colour profiles are not applied.
 
     Args:
-        path: the file. Its name does not matter, its content does.
-        background: grey level in [0, 1] under transparent pixels; white, as the paper fills views.
+        path: the file. The format is detected from its content, not its name.
+        background: grey level in [0, 1] under transparent pixels. Default: white, as in the paper.
 
     Raises:
-        UserError: missing, empty, truncated, not a raster picture, under 16 pixels on a side, or
-            over Pillow's limit on pixels (``PIL.Image.MAX_IMAGE_PIXELS``).
+        UserError: missing, empty, truncated, not a raster image, under 16 pixels per side, or over
+            Pillow's limit on pixels (``PIL.Image.MAX_IMAGE_PIXELS``).
     """
     path = Path(path)
     if not path.is_file():
@@ -75,7 +75,7 @@ def load_image(path: str | Path, *, background: float = 1.0) -> Float[np.ndarray
                         f"it needs at least {MIN_SIDE} on each side."
                     )
                 frames = getattr(image, "n_frames", 1)
-                if image.format != "MPO":  # a phone's MPO holds a thumbnail, too
+                if image.format != "MPO":  # MPO files of phones also hold a thumbnail
                     _one_of(frames, path)
                 if deep_images.is_png(head):
                     turn = image.getexif().get(0x0112, 1)
@@ -86,25 +86,26 @@ def load_image(path: str | Path, *, background: float = 1.0) -> Float[np.ndarray
         raise
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
         raise UserError(
-            f"the image '{path}' has more than {Image.MAX_IMAGE_PIXELS} pixels; "
-            "scale it down first, a few thousand on a side are plenty."
+            f"the image '{path}' has more than {Image.MAX_IMAGE_PIXELS} pixels; scale it down (a "
+            "few thousand per side are plenty)."
         ) from error
     except UnidentifiedImageError as error:
         raise UserError(f"the image '{path}' {_guess(head)}") from error
     # Pillow's decoders raise almost anything on damaged files (OSError, SyntaxError, ValueError,
-    # struct.error, EOFError, ...), and for the user they all mean the same.
+    # struct.error, EOFError, ...); to the user it is all the same.
     except Exception as error:
         reason = str(error).rstrip(".") or type(error).__name__
         raise UserError(
-            f"the image '{path}' is damaged or cut short and cannot be decoded ({reason})."
+            f"the image '{path}' is damaged or truncated and cannot be decoded ({reason})."
         ) from error
     return pixels
 
 
 def is_normal_map(rgb: Float[np.ndarray, "height width 3"]) -> bool:
-    """Whether colours are unit vectors on one side of a surface, as ``rgb = (n + 1) / 2``.
+    """Whether the colours are unit normals of one side of a surface, encoded as ``rgb = (n + 1) /
+    2``.
 
-    Nearly all are of length 1 and point up, and they point up on the whole.
+    Nearly all must have length 1 and point up, and so must their mean.
     """
     step = max(1, int(np.sqrt(rgb.shape[0] * rgb.shape[1] / 250_000)))
     normals = 2.0 * rgb[::step, ::step].reshape(-1, 3) - 1.0
@@ -115,10 +116,10 @@ def is_normal_map(rgb: Float[np.ndarray, "height width 3"]) -> bool:
 
 
 def from_array(picture: np.ndarray) -> Float[np.ndarray, "height width 3"]:
-    """A picture in memory as float32 RGB in [0, 1]: grey, RGB or RGBA (over white), as integers of
-    8 or 16 bits or as floats in [0, 1].
+    """Convert an image array to float32 RGB in [0, 1]. Accepts grey, RGB or RGBA (composited over
+    white), as 8- or 16-bit integers or as floats in [0, 1].
 
-    Raises `UserError` with the end of a sentence that begins with whose picture it is.
+    Raises `UserError` whose message is a sentence without its subject, which the caller adds.
     """
     if picture.ndim == 2:
         picture = picture[..., None]
@@ -137,7 +138,7 @@ def from_array(picture: np.ndarray) -> Float[np.ndarray, "height width 3"]:
     elif np.issubdtype(picture.dtype, np.floating):
         values = picture.astype(np.float32)
         if not (np.isfinite(values).all() and values.min() >= 0 and values.max() <= 1):
-            raise UserError("is a picture whose floats are not all in [0, 1]: divide them first.")
+            raise UserError("is a picture with floats outside [0, 1]: rescale them first.")
     else:
         raise UserError(
             f"is a picture of {picture.dtype}: give 8 or 16 bit integers, or floats in [0, 1]."
@@ -150,12 +151,12 @@ def from_array(picture: np.ndarray) -> Float[np.ndarray, "height width 3"]:
 
 def _one_of(frames: int, path: Path) -> None:
     if frames > 1:
-        told = f"'{path}' is an animation or has pages: the first of {frames} frames"
-        warnings.warn(f"{told} is taken.", stacklevel=3)
+        told = f"'{path}' has {frames} frames or pages: the first one"
+        warnings.warn(f"{told} is used.", stacklevel=3)
 
 
 def _deep(path: Path) -> bool:
-    """Whether a TIFF has more than eight bits a sample, or is none that Pillow knows."""
+    """Whether a TIFF has more than eight bits per sample, or is unknown to Pillow."""
     from PIL import Image, UnidentifiedImageError
 
     try:
@@ -166,7 +167,7 @@ def _deep(path: Path) -> bool:
 
 
 def fault(content: bytes) -> str:
-    """Why a mesh's texture can't be decoded, the end of a sentence; empty if it can."""
+    """Why a mesh's texture can't be decoded, as the predicate of a sentence; empty if it can."""
     import io
 
     from PIL import Image
@@ -181,29 +182,29 @@ def fault(content: bytes) -> str:
     except Image.DecompressionBombError:
         return f"has more than {Image.MAX_IMAGE_PIXELS} pixels"
     except Exception:  # as in `load_image`
-        return "is no picture that can be read"
+        return "is not a readable image"
 
 
 def fault_of(image: Image.Image) -> str:
-    """The same of a picture that Pillow has opened. Decodes it."""
+    """Like `fault`, for an image already opened by Pillow. Decodes it."""
     from PIL import Image
 
     if image.format is not None and image.format not in TEXTURE_FORMATS:
-        return f"is of the format {image.format}, which is not read"
+        return f"has the unsupported format {image.format}"
     if Image.MAX_IMAGE_PIXELS and image.width * image.height > Image.MAX_IMAGE_PIXELS:
         return f"has more than {Image.MAX_IMAGE_PIXELS} pixels"
     try:
         image.load()
     except Exception:  # as in `load_image`
-        return "is damaged or cut short"
+        return "is damaged or truncated"
     return ""
 
 
 def luminance(rgb: Array) -> Array:
-    """Grey levels of an image, (..., 3) -> (...): 0.299 R + 0.587 G + 0.114 B (ITU-R BT.601).
+    """Luma of an image, (..., 3) -> (...): 0.299 R + 0.587 G + 0.114 B (ITU-R BT.601).
 
-    The weights are for sRGB-coded values, as :func:`load_image` returns; they sum to 1, so grey
-    stays what it is. Takes NumPy arrays and torch tensors.
+    The weights apply to sRGB-encoded values, as :func:`load_image` returns. They sum to 1, so grey
+    is unchanged. Accepts NumPy arrays and torch tensors.
     """
     return 0.299 * rgb[..., 0] + 0.587 * rgb[..., 1] + 0.114 * rgb[..., 2]
 
@@ -226,7 +227,7 @@ def _rgb(image: Image.Image, path: Path, background: float) -> np.ndarray:
 
 
 def _guess(head: bytes) -> str:
-    """Why Pillow does not know the file, as far as its first bytes tell."""
+    """Guess from the first bytes why Pillow doesn't recognise the file."""
     text = head.lstrip(b"\xef\xbb\xbf \t\r\n").lower()
     if text.startswith(b"<svg") or (text.startswith(b"<?xml") and b"<svg" in text):
         return "is an SVG drawing; export it as PNG first."

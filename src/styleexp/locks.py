@@ -1,4 +1,4 @@
-"""Who works in a folder: a file lock that ends with its process, however that ends."""
+"""Folder locks: file locks that are released even if the process is killed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 NAME = ".lock"
 _taken: dict[str, FileLock] = {}
-"""Locks that this process has taken and not used yet, by their folders."""
+"""Locks that this process has taken and not used yet, keyed by folder."""
 
 
 class Busy(Exception):
@@ -22,10 +22,10 @@ class Busy(Exception):
 
 @contextmanager
 def hold(folder: Path, timeout: float = 0.0) -> Iterator[None]:
-    """Hold a folder's lock; `Busy` if it isn't free within ``timeout`` seconds (-1 waits for ever).
+    """Hold a folder's lock; raise `Busy` after ``timeout`` seconds (-1 waits forever).
 
-    The kernel releases it when the process ends, kill -9 included. Raises ``OSError`` where the
-    folder can't be written or its file system has no locks.
+    The kernel releases it when the process ends, even after kill -9. Raises ``OSError`` if the
+    folder isn't writable or its file system has no locks.
     """
     lock = _taken.pop(os.path.abspath(folder), None) or _acquired(folder, timeout)
     try:
@@ -35,15 +35,15 @@ def hold(folder: Path, timeout: float = 0.0) -> Iterator[None]:
 
 
 def take(folder: Path, timeout: float = 0.0) -> None:
-    """Take a folder's lock for the next `hold` of this process, or until `drop` or its end.
+    """Take a folder's lock for this process's next `hold`, or until `drop` or exit.
 
-    Raises what `hold` raises.
+    Raises the same as `hold`.
     """
     _taken[os.path.abspath(folder)] = _acquired(folder, timeout)
 
 
 def drop(folder: Path) -> None:
-    """Let go what was taken, if it was."""
+    """Release a lock taken by `take`, if any."""
     lock = _taken.pop(os.path.abspath(folder), None)
     if lock is not None:
         lock.release()
@@ -64,7 +64,7 @@ def _acquired(folder: Path, timeout: float) -> FileLock:
 
 
 def held(folder: Path) -> bool:
-    """Whether a process holds the folder's lock now; nobody does where the folder is read-only."""
+    """Whether a process holds the folder's lock now; False for a read-only folder."""
     if os.path.abspath(folder) in _taken:
         return True
     if not (folder / NAME).exists():

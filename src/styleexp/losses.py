@@ -1,4 +1,5 @@
-"""Gram matrices and the style loss (Sec. 3.3.2 and 3.3.3, Eqs. 3-8); Text2Mesh's, to compare."""
+"""Gram matrices and the style loss (Sec. 3.3.2 and 3.3.3, Eqs. 3-8), and Text2Mesh's loss for
+comparison."""
 
 from __future__ import annotations
 
@@ -30,11 +31,12 @@ def gram_matrix(
     mask: Bool[Tensor, "views height width"] | None = None,
     normalisation: str = "channels_cells",
 ) -> Float[Tensor, "channels channels"]:
-    """G = F^T F of all views together, divided as ``LossConfig.normalisation`` says.
+    """G = F^T F over all views, normalised as in ``LossConfig.normalisation``.
 
-    The paper's Eqs. 3-6 sum over views and add matrices of different layers; read here as one Gram
-    per layer, averaged over views. With a mask, only its cells are summed and counted, so the share
-    of the frame that the object fills doesn't matter. An empty mask gives zeros.
+    The paper's Eqs. 3-6 sum over views and add matrices of different layers; here this is read as
+    one Gram per layer, averaged over views. With a mask, only masked cells are summed and counted,
+    so the result doesn't depend on how much of the frame the object fills. An empty mask gives
+    zeros.
     """
     cells = features[:, 0].numel()
     return mean_gram(_Gram.apply(features, mask), mask, cells, normalisation)
@@ -46,19 +48,18 @@ def mean_gram(
     cells: int,
     normalisation: str = "channels_cells",
 ) -> Float[Tensor, "channels channels"]:
-    """A sum of F^T F over the masked ones of so many cells, divided as
-    ``LossConfig.normalisation`` says."""
+    """Normalise a sum of F^T F over the masked cells, as in ``LossConfig.normalisation``."""
     if normalisation == "none":
         return total
     count = cells if mask is None else mask.sum().clamp(min=1)
-    # A sum of C x C squares becomes their mean where what is squared is divided by C.
+    # Dividing by C before squaring turns the sum of C x C squares into their mean.
     channels = {"cells": 1, "channels_cells": len(total), "mean": len(total) ** 2}[normalisation]
     return total / (channels * count)
 
 
 class _Gram(torch.autograd.Function):
-    """The sum over views and masked cells. Its gradient F (D + D^T) is one product; autograd, which
-    doesn't know that both factors are the same, takes two and a masking."""
+    """Sum over views and masked cells. Its gradient F (D + D^T) takes one product; plain autograd,
+    unaware that both factors are equal, takes two and a masking."""
 
     @staticmethod
     def forward(ctx, features, mask):
@@ -68,8 +69,7 @@ class _Gram(torch.autograd.Function):
             cells = cells * mask.reshape(views, height * width, 1).to(cells.dtype)
         ctx.save_for_backward(cells)
         ctx.cells = (height, width)
-        # Views are summed in float32 (or better): with bfloat16 features that keeps the sum's own
-        # rounding small.
+        # Sum views in float32 (or better) to keep the rounding error small with bfloat16 features.
         per_view = torch.bmm(cells.transpose(1, 2), cells)
         return per_view.to(torch.promote_types(per_view.dtype, torch.float32)).sum(0)
 
@@ -86,16 +86,16 @@ class _Gram(torch.autograd.Function):
 def layer_mask(
     coverage: Float[Tensor, "views height width"], shape: tuple[int, int], erosion: int
 ) -> Bool[Tensor, "views cells_y cells_x"]:
-    """Cells of a layer that see only foreground: wholly covered, and ``erosion`` cells from the
-    nearest cell that is not. The frame's own border does not erode."""
+    """Cells of a layer that see only foreground: fully covered, and ``erosion`` cells from the
+    nearest cell that isn't. The frame's border doesn't erode."""
     return layer_masks(coverage, [shape], erosion)[0]
 
 
 def layer_masks(
     coverage: Float[Tensor, "views height width"], shapes: Sequence[tuple[int, int]], erosion: int
 ) -> list[Bool[Tensor, "views cells_y cells_x"]]:
-    """`layer_mask` of several layers, from one summed-area table of what is not covered: a cell and
-    those around it are one rectangle of pixels."""
+    """`layer_mask` for several layers, from one summed-area table of uncovered pixels: a cell and
+    its neighbours form one rectangle of pixels."""
     background = ~(1 - coverage.detach() < 0.5)
     summed = functional.pad(background, (1, 0, 1, 0)).to(torch.int32)
     for dim in (1, 2):
@@ -106,7 +106,7 @@ def layer_masks(
         for dim, cells in enumerate(shape, 1):
             size, cell = coverage.shape[dim], torch.arange(cells, device=coverage.device)
             first, last = (cell - erosion).clamp_min(0), (cell + erosion).clamp_max(cells - 1)
-            # Sizes that don't divide: a cell is of all pixels that it touches.
+            # Sizes that don't divide evenly: a cell covers all pixels it touches.
             begin, end = first * size // cells, ((last + 1) * size + cells - 1) // cells
             counted = counted.index_select(dim, end) - counted.index_select(dim, begin)
         masks.append(counted == 0)
@@ -114,7 +114,7 @@ def layer_masks(
 
 
 class StyleLoss:
-    """Measures images in the encoder's Gram matrices and compares them with a target."""
+    """Computes the Gram matrices of images and their distance to a target."""
 
     def __init__(self, config: LossConfig, encoder: Encoder):
         self.config = config
@@ -123,9 +123,9 @@ class StyleLoss:
         self.weights = [config.block_weights[int(name[4]) - 1] for name in self.layers]
 
     def grams(self, seen: Images) -> Grams:
-        """One Gram per style layer, over the foreground alone if so configured."""
+        """One Gram per style layer, over the foreground only if configured."""
         images = seen.image.permute(0, 3, 1, 2)
-        # A subclass may serve other activations than those that ours takes the sums of.
+        # A subclass may use activations other than those that the fused path sums.
         if type(self.encoder) is Encoder and self.encoder.is_fused:
             cells = [
                 (images.shape[2] // stride, images.shape[3] // stride)
@@ -151,14 +151,14 @@ class StyleLoss:
     def _masks(
         self, seen: Images, cells: Sequence[tuple[int, int]]
     ) -> Sequence[Bool[Tensor, "n rows columns"] | None]:
-        """Which cells count of layers of these sizes."""
+        """Masks of the cells that count, for layers of these sizes."""
         if not self.config.masked:
             return [None] * len(cells)
         return layer_masks(seen.coverage, cells, self.config.erosion)
 
     def distance(self, grams: Grams, target: Grams, scales: list[Tensor]) -> Float[Tensor, ""]:
-        """Weighted sum over layers of the squared Frobenius distance (Eq. 8), each divided by its
-        scale."""
+        """Weighted sum over layers of the squared Frobenius distances (Eq. 8), each divided by its
+        layer's scale."""
         total = grams[0].new_zeros(())
         for gram, goal, weight, scale in zip(grams, target, self.weights, scales, strict=True):
             total = total + weight * (gram - goal).square().sum() / scale
@@ -167,8 +167,8 @@ class StyleLoss:
     def scales(self, target: Grams, source: Grams) -> list[Tensor]:
         """The divisor of each layer's distance: see ``LossConfig.relative``.
 
-        Infinite, so that the layer doesn't count, where the target is empty: at its resolution no
-        cell sees foreground alone.
+        Infinite, which disables the layer, if the target is empty because no cell at that
+        resolution sees only foreground.
         """
         divisors = []
         for goal, own in zip(target, source, strict=True):
@@ -178,7 +178,7 @@ class StyleLoss:
             elif self.config.relative == "target":
                 scale = norm
             else:
-                # A layer in which source and style hardly differ must not drown the others.
+                # A layer in which source and style hardly differ must not dominate the others.
                 scale = torch.maximum((own - goal).square().sum(), 0.02 * norm)
             divisors.append(torch.where(norm > 0, scale, torch.inf))
         return divisors
@@ -187,7 +187,7 @@ class StyleLoss:
 class ClipLoss:
     """Text2Mesh's loss (Michel et al. 2022): one minus the cosine between two mean embeddings.
 
-    Embeddings stand where `StyleLoss` has Gram matrices, so everything else of a run is the same.
+    Embeddings take the place of `StyleLoss`'s Gram matrices; the rest of a run is the same.
     """
 
     def __init__(self, config: LossConfig, encoder: ClipEncoder):
@@ -205,9 +205,9 @@ class ClipLoss:
     def distance(
         self, grams: list[Tensor], target: list[Tensor], scales: list[Tensor]
     ) -> Float[Tensor, ""]:
-        """From 0, the same direction, to 2."""
+        """One minus the cosine, from 0 (same direction) to 2 (opposite)."""
         return 1 - functional.cosine_similarity(grams[0], target[0], dim=0)
 
     def scales(self, target: list[Tensor], source: list[Tensor]) -> list[Tensor]:
-        """Nothing is divided: cosines compare as they are."""
+        """Ones: cosines need no scaling."""
         return [torch.ones_like(target[0][0])]

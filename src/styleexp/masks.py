@@ -1,7 +1,7 @@
-"""Where the relief goes: ``style.mask``, a factor from 0 to 1 at each of the source's vertices.
+"""Masks (``style.mask``): a factor from 0 to 1 on the relief at each source vertex.
 
-A mask is read of the source as it is displaced: after it was refined, before it gets its relief.
-Where it is 0 vertices stay where they are, to the last bit.
+A mask is evaluated on the refined source, before displacement. Vertices where it is 0 stay bit for
+bit in place.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 
 CHANNELS = ("r", "g", "b", "a", "luminance")
 OF_THE_FILE = ("attribute", "color", "texture")
-"""Masks that need what only a file's own vertices have."""
+"""Mask kinds that need data stored with a file's vertices."""
 KNOWN = (
     "attribute:NAME, color:r|g|b|a|luminance, texture:FILE, slope:DEGREES or height:LOW..HIGH, "
-    "with not: in front for the rest"
+    "with the prefix not: to invert it"
 )
 ROUNDING = 1e-6
-"""What a mask may be off by 0 or 1 and still be taken for it."""
+"""Tolerance within which mask values snap to 0 or 1."""
 CELLS = 8
-"""On a border's width: vertices that share a cell are one where a mask is smoothed."""
+"""Grid cells per border width; smoothing merges vertices that share a cell."""
 
 
 @dataclass(frozen=True)
@@ -42,29 +42,29 @@ class Term:
     """One of the masks that are multiplied."""
 
     text: str
-    """As it was given."""
+    """The term as the user wrote it."""
     kind: str
     value: str
     inverted: bool
 
 
 def parsed(mask: Any) -> list[Term]:
-    """The terms of ``style.mask``. Raises `UserError` for what is none."""
+    """Parse the terms of ``style.mask``. Raises `UserError` for an invalid one."""
     if mask is None:
         return []
     given = list(mask) if isinstance(mask, Sequence) and not isinstance(mask, str) else [mask]
     if not given:
-        raise UserError("style.mask=[] holds no mask: leave it out for the whole surface.")
+        raise UserError("style.mask=[] is empty: leave it out to use the whole surface.")
     return [_term(each) for each in given]
 
 
 def files(mask: Any) -> list[str]:
-    """The pictures that ``style.mask`` names, in its order."""
+    """Image files named in ``style.mask``, in order."""
     return [term.value for term in parsed(mask) if term.kind == "texture"]
 
 
 def with_files(mask: Any, paths: Sequence[str]) -> Any:
-    """The same mask with other paths of its pictures, in its order."""
+    """Copy of a mask with its image paths replaced, in order."""
     found = iter(paths)
     texts = [
         f"{'not:' * term.inverted}texture:{next(found)}" if term.kind == "texture" else term.text
@@ -74,7 +74,8 @@ def with_files(mask: Any, paths: Sequence[str]) -> Any:
 
 
 def check(config: StyleConfig, source: Mesh) -> None:
-    """Raise `UserError` where the source lacks what ``style.mask`` or ``style.direction`` needs."""
+    """Raise `UserError` if the source lacks data that ``style.mask`` or ``style.direction``
+    needs."""
     for term in parsed(config.mask):
         _values(term, source)
     if config.direction.startswith(attributes.ATTRIBUTE):
@@ -83,8 +84,8 @@ def check(config: StyleConfig, source: Mesh) -> None:
 
 
 def weights(config: StyleConfig, source: Mesh) -> Float[np.ndarray, " vertices"]:
-    """``style.mask`` at the source's vertices, 0 to 1: the product of its terms, its borders
-    smoothed over ``style.falloff``. Raises `UserError` where it selects nothing."""
+    """``style.mask`` at the source's vertices, 0 to 1: the product of its terms, with borders
+    smoothed over ``style.falloff``. Raises `UserError` if it selects nothing."""
     factor: np.ndarray = np.ones(len(source.vertices))
     for term in parsed(config.mask):
         factor = factor * _values(term, source)
@@ -100,19 +101,19 @@ def weights(config: StyleConfig, source: Mesh) -> Float[np.ndarray, " vertices"]
 def masked(
     displacement: Float[Tensor, " vertices"], mask: Float[Tensor, " vertices"] | None
 ) -> Float[Tensor, " vertices"]:
-    """The displacement within the mask; None is everywhere."""
+    """Multiply the displacement by the mask; None means 1 everywhere."""
     return displacement if mask is None else displacement * mask.to(displacement)
 
 
 def softened(
     mesh: Mesh, factor: Float[np.ndarray, " vertices"], width: float
 ) -> Float[np.ndarray, " vertices"]:
-    """A factor's mean around each vertex, by area, within half of ``width`` (in radii of the
-    normalised mesh): a step becomes a smooth border of that width.
+    """Area-weighted mean of a factor within ``width / 2`` of each vertex, in radii of the
+    normalised mesh. A step becomes a smooth border of that width.
 
-    What is uniform stays as it is to the last bit, 0 farther from any other value than that too,
-    and what is 1 minus another factor stays so. Surfaces that face away don't count, so that a
-    thin part's other side doesn't.
+    Uniform factors stay bit-identical, zeros farther than that from any other value stay 0, and
+    complementary factors stay complementary. Surfaces that face away are ignored, so that the two
+    sides of a thin part don't mix.
     """
     from scipy.spatial import cKDTree
 
@@ -122,7 +123,7 @@ def softened(
     normals = vertex_normals(points, mesh.faces)
     thirds = np.repeat(face_areas(points, mesh.faces) / 3, 3)
     areas = np.bincount(mesh.faces.ravel(), thirds, minlength=len(points)) + 1e-12
-    # Vertices of one cell that face the same octant are one.
+    # Merge vertices of one cell whose normals are in the same octant.
     cells = np.floor(points * (CELLS / width)).astype(np.int64)
     cells = np.column_stack([cells, normals > 0])
     _, of = np.unique(cells, axis=0, return_inverse=True)
@@ -135,7 +136,7 @@ def softened(
     low, high = np.full(len(total), np.inf), np.full(len(total), -np.inf)
     np.minimum.at(low, of, factor)
     np.maximum.at(high, of, factor)
-    mean = np.clip(np.bincount(of, areas * factor) / total, low, high)  # uniform cells stay so
+    mean = np.clip(np.bincount(of, areas * factor) / total, low, high)  # uniform cells stay uniform
     tree, half = cKDTree(centre), width / 2
     result = np.empty(len(points))
     for some in np.array_split(np.arange(len(points)), max(1, len(points) // 20_000)):
@@ -155,7 +156,7 @@ def _term(given: Any) -> Term:
     kind, colon, value = rest.partition(":")
     known = colon and value and kind in (*OF_THE_FILE, "slope", "height")
     if not isinstance(given, str) or not known:
-        raise UserError(f"style.mask={text} is no mask: give {KNOWN}.")
+        raise UserError(f"style.mask={text} is not a mask: give {KNOWN}.")
     if kind == "color" and value not in CHANNELS:
         raise UserError(f"style.mask={text} is not allowed: give color:{'|'.join(CHANNELS)}.")
     if kind == "slope" and not 0 < _number(value) < 180:
@@ -166,7 +167,7 @@ def _term(given: Any) -> Term:
 
 
 def _number(text: str) -> float:
-    """NaN where the text is no number."""
+    """Parse a number; NaN if the text isn't one."""
     return float(text) if re.fullmatch(r"\d+\.?\d*|\.\d+", text) else float("nan")
 
 
@@ -174,14 +175,14 @@ def _band(text: str, value: str) -> tuple[float, float]:
     low, _, high = value.partition("..")
     if not 0 <= _number(low) < _number(high) <= 1:
         raise UserError(
-            f"style.mask={text} is not allowed: give height:LOW..HIGH in shares of the source's "
-            "height, as in height:0.5..1 for its upper half."
+            f"style.mask={text} is not allowed: give height:LOW..HIGH in fractions of the source's "
+            "height, such as height:0.5..1 for its upper half."
         )
     return _number(low), _number(high)
 
 
 def _values(term: Term, source: Mesh) -> Float[np.ndarray, " vertices"]:
-    """A term at the source's vertices, 0 to 1."""
+    """Evaluate a term at the source's vertices, 0 to 1."""
     found = {
         "attribute": _attribute,
         "color": _color,
@@ -189,7 +190,7 @@ def _values(term: Term, source: Mesh) -> Float[np.ndarray, " vertices"]:
         "slope": _slope,
         "height": _height,
     }[term.kind](term, source)
-    # What is 0 or 1 but for rounding is so, or the relief would go where it shouldn't.
+    # Snap values that differ from 0 or 1 by rounding, so that no relief leaks out.
     found = np.where(found < ROUNDING, 0.0, np.where(found > 1 - ROUNDING, 1.0, found))
     return 1 - found if term.inverted else found
 
@@ -199,8 +200,8 @@ def _attribute(term: Term, source: Mesh) -> np.ndarray:
     low, high = values.min(), values.max()
     if low < -ROUNDING or high > 1 + ROUNDING:
         raise UserError(
-            f"style.mask={term.text}: its values in '{source.name}' go from {low:g} to {high:g}, "
-            "and a mask's from 0 to 1: scale them in the program that wrote them."
+            f"style.mask={term.text}: its values in '{source.name}' range from {low:g} to "
+            f"{high:g}, but a mask must be in 0 to 1: rescale them in the program that wrote them."
         )
     return values.clip(0, 1)
 
@@ -236,8 +237,8 @@ def _texture(term: Term, source: Mesh) -> np.ndarray:
 def sampled(
     picture: Float[np.ndarray, "height width"], uv: Float[np.ndarray, "points 2"]
 ) -> Float[np.ndarray, " points"]:
-    """A picture at texture coordinates, bilinear, repeated beyond [0, 1] (but one border
-    does not shine into the other); row 0 is at v = 1."""
+    """Sample an image at texture coordinates: bilinear, repeated outside [0, 1] (without blending
+    opposite borders); row 0 is at v = 1."""
     rows, columns = picture.shape
     uv = np.where((uv >= 0) & (uv <= 1), uv, uv - np.floor(uv))
     y, x = (1 - uv[:, 1]) * rows - 0.5, uv[:, 0] * columns - 0.5

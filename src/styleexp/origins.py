@@ -1,7 +1,7 @@
-"""The files that a run was made from: where they lay, and whether they are still the same.
+"""The input files of a run: where they were, and whether they are unchanged.
 
-Whatever comes back to a run (``resume=``, metrics, maps, pages, figures) reads them through here,
-from any working folder: a file is the run's if its content is the recorded one, not if its name is.
+Everything that reopens a run (``resume=``, metrics, maps, pages, figures) finds its files through
+this module, from any working folder. A file is matched by its content, not by its name.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 
 def describe(config: Config) -> dict[str, dict[str, str | None]]:
-    """Name, absolute path and sha256 of the source, the style and the mask's pictures, by
-    `identity.parts`, for the run's record; analytic shapes have no file, their definition is this
-    version's. Raises `UserError` for what isn't there."""
+    """Name, absolute path and sha256 of the source, the style and the mask's images, keyed as in
+    `identity.parts`, for the run's record. Analytic shapes have no file; the package version
+    defines them. Raises `UserError` for a missing file."""
     found = {}
     for kind, part in identity.parts(config).items():
         path = sources.locate(kind, part.name, part.path)
@@ -38,18 +38,18 @@ def describe(config: Config) -> dict[str, dict[str, str | None]]:
 
 
 def noted(config: Config) -> dict[str, Any]:
-    """``assets``, see `describe`, and the ``weights`` of encoder and judge, as far as they are
-    there: for the record of a run that is about to begin."""
+    """``assets``, see `describe`, and the ``weights`` of encoder and judge, as far as available,
+    for the record of a run that is about to start."""
     from styleexp import metrics
 
     record: dict[str, Any] = {"weights": {}}
-    with suppress(UserError, OSError):  # the run itself will say so
+    with suppress(UserError, OSError):  # the run itself reports it
         record["assets"] = describe(config)
     names = {config.encoder.name}
     with suppress(UserError):
         names.add(metrics.judge_name(config.metrics.judge, config.encoder.name) or "")
     for name in sorted(names & set(assets.names("weights"))):
-        # Their content is checked against what was published whenever they are read.
+        # Their content is checked against the published hash whenever they are read.
         if path := assets.locate(name, "weights"):
             record["weights"][name] = {
                 "path": str(path.absolute()),
@@ -64,10 +64,10 @@ def restored(
     purpose: str,
     tell: Callable[[str], Any] | None = None,
 ) -> Config:
-    """The configuration of a run's record, with the very files that the run was made from.
+    """The configuration in a run's record, with the exact files that the run used.
 
-    ``tell`` takes notes for the user; by default they are printed to standard error. Raises
-    `UserError` for a file that has changed or is gone, and what `compose.recorded` raises.
+    ``tell`` receives notes for the user; by default they are printed to standard error. Raises
+    `UserError` for a file that has changed or is missing, and the errors of `compose.recorded`.
     """
     from styleexp import compose, masks
 
@@ -93,9 +93,9 @@ def find(
     folder: Path,
     tell: Callable[[str], Any] | None = None,
 ) -> Path | None:
-    """The file that the run in ``folder`` had for its source or style; None where it had none.
+    """The file that the run in ``folder`` used as source or style; None if it used none.
 
-    Raises `UserError`, with the end of a sentence, for a file that has changed or is gone.
+    Raises `UserError`, whose message lacks the subject, for a file that has changed or is missing.
     """
     part = identity.parts(config)[kind]
     told = (record.get("assets") or {}).get(kind) or {}
@@ -104,7 +104,7 @@ def find(
         path = sources.locate(kind, part.name, part.path)
         if path is None:
             return None
-        raise UserError(f"its record has no sha256 of its {kind} '{path}': start the run anew.")
+        raise UserError(f"its record has no sha256 of its {kind} '{path}': start the run again.")
     named = Path(str(told.get("path") or part.path or part.name))
     there = False
     for path in _candidates(named, kind, part, folder):
@@ -113,21 +113,20 @@ def find(
         if identity.sha256(path) == digest:
             if path != named:
                 (tell or _tell)(
-                    f"note: the {kind} of '{folder}' was '{named}'; '{path}' is the same file, by "
-                    "its sha256, and is used."
+                    f"note: the {kind} of '{folder}' was '{named}'; using '{path}', which has the "
+                    "same sha256."
                 )
             return path
         there = there or path == named or not named.is_absolute()
     where = "" if named.is_absolute() else f" (looked for in '{Path.cwd()}')"
-    what = "has changed since the run began" if there else "is gone"
-    raise UserError(
-        f"its {kind} '{named}' {what}{where}: put it back as it was, or start the run anew."
-    )
+    what = "has changed since the run began" if there else "is missing"
+    raise UserError(f"its {kind} '{named}' {what}{where}: restore it, or start the run again.")
 
 
 def _candidates(named: Path, kind: str, part: Any, folder: Path) -> Iterator[Path]:
-    """Where a run's file may lie: where it lay, or, for records without absolute paths and folders
-    that were moved together, as far from the run's folder or this one; or where its name leads."""
+    """Candidate locations of a run's file: its recorded path; the same relative path from the run's
+    folder or the current one (for records without absolute paths, and folders moved together); or
+    wherever its name resolves to."""
     if named.is_absolute():
         yield named
     typed = Path(part.path) if part.path else named

@@ -1,7 +1,7 @@
-"""Overrides as people type them, turned into Hydra's grammar.
+"""Convert overrides as typed by users to Hydra's grammar.
 
-Hydra's grammar gives a meaning to spaces, brackets, quotes, commas, ``=``, ``$`` and most letters
-that are not English. A file's name may hold any of them, so the values of keys that name files are
+Hydra's grammar gives a meaning to spaces, brackets, quotes, commas, ``=``, ``$`` and most
+non-English letters, all of which may occur in file names. So the values of keys that name files are
 quoted here, and a word without ``=`` is the source or the style.
 """
 
@@ -16,25 +16,25 @@ from typing import Any
 from styleexp.errors import UserError
 
 FILES = ("path", "weights", "dir", "folder", "file")
-"""Last words of the keys whose values are files and folders, plugins' included."""
+"""Last components of keys whose values are files or folders, including those of plugins."""
 PARTS = ("source", "style")
-"""What words without ``=`` are, in this order; the keys that take a name or a file."""
+"""Keys that take a name or a file; words without ``=`` are assigned to them in this order."""
 FUNCTION = re.compile(r"(choice|glob|interval|range|shuffle|sort|tag)\(.*\)", re.DOTALL)
-"""Hydra's functions, which make several values of one."""
+"""Hydra functions that expand to several values."""
 PLAIN = re.compile(r"(\.{0,2}/)?[A-Za-z_][\w./-]*", re.ASCII)
-"""What Hydra reads as this very text, unless it is a constant."""
+"""Text that Hydra parses literally, unless it is a constant."""
 CONSTANTS = ("null", "true", "false", "nan", "inf")
 
 
 def understood(words: Sequence[str], multirun: bool = False) -> list[str]:
-    """The words of a command line as overrides of Hydra's.
+    """Convert command-line words to Hydra overrides.
 
-    Up to two words without ``=`` are the source and the style, names or files. ``source=`` and
-    ``style=`` take either, too. With ``multirun`` a comma separates values, unless the whole is a
-    file that exists. What is in Hydra's quotes already stays as it is.
+    Up to two words without ``=`` are the source and the style, as names or files. ``source=`` and
+    ``style=`` also accept either. With ``multirun`` a comma separates values, unless the whole
+    value is an existing file. Values already quoted for Hydra are left alone.
 
-    Raises `UserError` for a third such word, for a part that is given twice, for names and files
-    mixed in one sweep, and for a name that is not valid UTF-8.
+    Raises `UserError` for a third such word, a part given twice, names and files mixed in one
+    sweep, and a name that isn't valid UTF-8.
     """
     for word in words:
         _check_text(word)
@@ -54,7 +54,7 @@ def understood(words: Sequence[str], multirun: bool = False) -> list[str]:
 
 
 def is_file(part: str, value: str) -> bool:
-    """Whether the value of ``source`` or ``style`` is a file, and no name: it is not known as one,
+    """Whether the value of ``source`` or ``style`` is a file, not a name: it isn't a known name,
     and has a suffix or a folder, or exists."""
     if _known(part, value):
         return False
@@ -63,20 +63,20 @@ def is_file(part: str, value: str) -> bool:
 
 
 def exists(name: str) -> bool:
-    """Whether there is such a file or folder, ``~`` being the home folder."""
+    """Whether the file or folder exists, with ``~`` expanded."""
     try:
         return bool(name) and os.path.exists(expanded(name))
-    except ValueError:  # it holds a zero byte
+    except ValueError:  # it contains a null byte
         return False
 
 
 def expanded(name: str) -> str:
-    """The name with a leading ``~`` as the home folder, unless there is a file of that name."""
+    """Expand a leading ``~`` to the home folder, unless a file of that literal name exists."""
     return os.path.expanduser(name) if name[:1] == "~" and not os.path.exists(name) else name
 
 
 def quote(value: str) -> str:
-    """A value that Hydra, and after it OmegaConf, read as this very text."""
+    """Quote a text so that Hydra, and then OmegaConf, read it literally."""
     if PLAIN.fullmatch(value) and value.lower() not in CONSTANTS:
         return value
     escaped = re.sub(r"(\\*)'", r"\1\1\\'", literal(value))
@@ -85,8 +85,7 @@ def quote(value: str) -> str:
 
 
 def literal(value: Any) -> Any:
-    """A value, with all in it, whose texts OmegaConf reads as these very texts, and not as
-    interpolations."""
+    """Escape all strings in a value, so that OmegaConf doesn't read them as interpolations."""
     if isinstance(value, dict):
         return {key: literal(each) for key, each in value.items()}
     if isinstance(value, list):
@@ -105,18 +104,18 @@ def _check_text(word: str) -> None:
         word.encode()
     except UnicodeEncodeError:
         raise UserError(
-            f"'{word}' is not valid UTF-8, which records and pages need: rename the file."
+            f"'{word}' is not valid UTF-8, which records and pages require: rename the file."
         ) from None
 
 
 def _is_override(word: str) -> bool:
     if re.fullmatch(r"~[\w@./-]+", word) and not word.startswith("~/"):
-        return not exists(word)  # Hydra's deletion of a key
+        return not exists(word)  # Hydra's syntax for deleting a key
     return "=" in word and not _is_files(word)
 
 
 def _is_files(word: str) -> bool:
-    """Whether a word with a ``=`` in it is a file of that name, or several between commas."""
+    """Whether a word that contains ``=`` names an existing file, or several separated by commas."""
     from styleexp.sources import SUFFIXES
 
     return all(
@@ -147,7 +146,7 @@ def _quoted(override: str, multirun: bool) -> str:
 
 
 def _part(part: str, value: str, multirun: bool) -> str:
-    """``source=`` or ``style=`` with names or with files."""
+    """Override for ``source=`` or ``style=``, given names or files."""
     values = [value]
     if multirun and not exists(value) and not FUNCTION.fullmatch(value):
         values = list(_split(value))
@@ -164,18 +163,18 @@ def _part(part: str, value: str, multirun: bool) -> str:
 
 
 def _files(key: str, value: str, multirun: bool) -> str:
-    """The value of a key that names a file, or several, in Hydra's grammar."""
+    """Value of a key that names one or several files, in Hydra's grammar."""
     if multirun and not exists(value) and not FUNCTION.fullmatch(value):
         return ",".join(map(_file, _split(value)))
     parts = value.split(",")
     if not multirun and len(parts) > 1 and not exists(value) and all(map(exists, parts)):
-        raise UserError(f"{key}={value} names {len(parts)} files: add -m to take each in turn.")
+        raise UserError(f"{key}={value} names {len(parts)} files: add -m to run each of them.")
     return value if multirun and FUNCTION.fullmatch(value) else _file(value)
 
 
 def _masks(value: str, multirun: bool) -> str:
-    """The value of ``style.mask`` in Hydra's grammar: a list is already, one mask may hold the name
-    of a file."""
+    """Value of ``style.mask`` in Hydra's grammar. Lists already are; a single mask may contain a
+    file name."""
     if value[:1] in ("[", "") or FUNCTION.fullmatch(value):
         return value
     each = _split(value) if multirun else [value]
@@ -183,15 +182,14 @@ def _masks(value: str, multirun: bool) -> str:
 
 
 def _file(value: str) -> str:
-    """One file's name in Hydra's grammar. What isn't there may be null, in Hydra's quotes already,
-    or an interpolation."""
+    """One file name in Hydra's grammar. A value that isn't an existing file may be null, already
+    quoted for Hydra, or an interpolation."""
     as_it_is = value.lower() in ("", "null") or _in_quotes(value) or "${" in value
     return value if as_it_is and not exists(value) else quote(expanded(value))
 
 
 def _split(value: str) -> Iterator[str]:
-    """Values between commas; a comma within quotes, or within the name of a file that exists, does
-    not separate."""
+    """Split at commas, except within quotes or within the name of an existing file."""
     parts = value.split(",")
     while parts:
         count = 1

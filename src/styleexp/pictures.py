@@ -1,7 +1,7 @@
-"""A style picture as heights: a photograph's tone, a height map, or a normal map integrated.
+"""Heights of a style image: a photo's tone, a height map, or an integrated normal map.
 
-A photograph doesn't tell how high its relief is; height maps and normal maps do, in proportion to
-the picture's longer side.
+A photo doesn't determine the amplitude of its relief; height maps and normal maps do, relative to
+the image's longer side.
 """
 
 from __future__ import annotations
@@ -23,36 +23,36 @@ if TYPE_CHECKING:
     from styleexp.config import Config, StyleConfig
 
 DEPTH = 0.1
-"""``style.image_depth`` of a height map where none is given."""
+"""Default of ``style.image_depth``."""
 LEAST_CONTRAST = 1e-3
-"""Standard deviation of a picture's tone, of 1, below which it is rounding alone."""
+"""Standard deviation of an image's tone in [0, 1], below which it is only rounding noise."""
 STEEPEST = 0.05
-"""Least z of a normal: what is steeper, 20 up to 1 along, is taken for so steep."""
+"""Minimum z of a normal; steeper ones are clamped to a slope of about 20."""
 SEAM = 2.0
-"""A picture whose opposite borders differ at most so many times as much as neighbouring rows and
-columns do tiles."""
+"""An image counts as tileable if its opposite borders differ by at most this multiple of the
+difference between neighbouring rows or columns."""
 
 
 @dataclass(frozen=True)
 class Heights:
-    """How high each pixel of a style picture lies."""
+    """Height of each pixel of a style image."""
 
     kind: str
     """``photo``, ``height``, ``normal`` or ``normal_dx``."""
     height: Float[Tensor, "height width"]
-    """Row 0 at the top. A photograph's tone, in no unit; of the other kinds in shares of the
-    picture's longer side."""
+    """Row 0 at the top. For a photo the tone, without a unit; else in fractions of the image's
+    longer side."""
 
     @property
     def in_proportion(self) -> bool:
-        """Whether the heights are in shares of the picture's side."""
+        """Whether the heights are in fractions of the image's longer side."""
         return self.kind != "photo"
 
 
 def kind_of(config: Config, picture: Float[np.ndarray, "height width 3"]) -> str:
-    """``style.kind``, or what ``auto`` finds: a normal map is known by its colours, which way its
-    green points by what can be integrated. For a method that compares renders with the picture's
-    tone ``auto`` is ``photo``."""
+    """Resolve ``style.kind``. ``auto`` detects a normal map by its colours, and the direction of
+    green by which one integrates better. For methods that compare renders with the image's tone,
+    ``auto`` is ``photo``."""
     if config.style.kind != "auto":
         return config.style.kind
     if config.baseline is None or not is_normal_map(picture):
@@ -62,9 +62,9 @@ def kind_of(config: Config, picture: Float[np.ndarray, "height width 3"]) -> str
 
 
 def picture_height(config: Config, picture: Float[np.ndarray, "height width 3"]) -> Heights:
-    """The picture's heights, as ``style.kind``, ``style.image_depth`` and ``style.invert`` say.
+    """The image's heights, according to ``style.kind``, ``style.image_depth`` and ``style.invert``.
 
-    Raises `UserError` for a picture without relief, or one that can't be of its kind.
+    Raises `UserError` for an image without relief, or one that doesn't match its kind.
     """
     style = config.style
     kind = kind_of(config, picture)
@@ -80,7 +80,8 @@ def picture_height(config: Config, picture: Float[np.ndarray, "height width 3"])
 
 
 def spread(height: Float[Tensor, "height width"]) -> float:
-    """Half the range of heights; of a map that is flat nearly everywhere half of all its range."""
+    """Half the percentile range of heights; for a map that is flat almost everywhere, half its full
+    range."""
     values = height.cpu().numpy().ravel()
     return max(half_range(values), 0.05 * float(np.ptp(values)), 1e-9)
 
@@ -89,26 +90,26 @@ def _check(config: StyleConfig, kind: str, picture: np.ndarray) -> None:
     name = config.path or config.name
     if config.image_depth is not None and kind != "height":
         raise UserError(
-            f"style.image_depth={config.image_depth} is read with style.kind=height alone, and "
-            f"'{name}' is read as {kind}: give that kind, or leave the depth out."
+            f"style.image_depth={config.image_depth} only applies to style.kind=height, but "
+            f"'{name}' is read as {kind}: add style.kind=height, or leave the depth out."
         )
     if kind.startswith("normal") and not is_normal_map(picture):
         raise UserError(
-            f"style.kind={kind}: '{name}' is no tangent-space normal map, its colours are not unit "
-            "vectors that point up on the whole: give style.kind=photo or style.kind=height."
+            f"style.kind={kind}: '{name}' is not a tangent-space normal map: its colours are not "
+            "unit vectors that point up on average; give style.kind=photo or style.kind=height."
         )
     tone = picture if kind.startswith("normal") else luminance(picture)[..., None]
     if tone.std(axis=(0, 1)).max() < LEAST_CONTRAST:
         raise UserError(
-            f"the style '{name}' is a picture of one tone, there is nothing to transfer: give one "
-            "with contrast."
+            f"the style '{name}' is a picture of uniform tone, so there is nothing to transfer: "
+            "give one with contrast."
         )
 
 
 def slopes(
     picture: Float[np.ndarray, "height width 3"], green_down: bool
 ) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
-    """Rise per pixel to the right and per pixel down of a normal map, without its mean tilt.
+    """Slopes of a normal map, per pixel to the right and per pixel down, without its mean tilt.
 
     ``(n + 1) / 2`` is red to the right, green up (OpenGL) or ``green_down`` (DirectX), blue out.
     """
@@ -121,10 +122,10 @@ def slopes(
 def integrated(
     right: Float[np.ndarray, "height width"], down: Float[np.ndarray, "height width"]
 ) -> tuple[Float[np.ndarray, "height width"], float]:
-    """The heights, in pixels, whose slopes come nearest to the given ones (Frankot and Chellappa
-    1988), and the share of the slopes' energy that is no height's.
+    """Least-squares heights, in pixels, for the given slopes (Frankot and Chellappa 1988), and the
+    fraction of the slopes' energy that isn't integrable.
 
-    A map that tiles is solved as periodic, any other with its mirror images.
+    Tileable maps are solved as periodic, others by mirroring.
     """
     rows, columns = right.shape
     if not (_tiles(right, down) and _tiles(right.T, down.T)):
@@ -147,6 +148,6 @@ def integrated(
 
 
 def _tiles(*columns: np.ndarray) -> bool:
-    """Whether the last column leads on to the first."""
+    """Whether the last column continues into the first."""
     inner = sum(np.abs(np.diff(each, axis=1)).mean() for each in columns)
     return sum(np.abs(each[:, 0] - each[:, -1]).mean() for each in columns) <= SEAM * inner

@@ -1,16 +1,16 @@
-"""Parts by name, built in or from other packages: find them, build them, explain failures.
+"""Find and build parts by name, built in or from plugins, and explain failures.
 
-A plugin is a `Spec`, which another package names in its entry points::
+A plugin is a `Spec` that another package declares in its entry points::
 
     [project.entry-points."styleexp.renderers"]
     my_renderer = "my_package.spec:MY_RENDERER"
 
-or which the environment variable ``STYLEEXP_PLUGINS`` names, for a quick experiment::
+or, for a quick experiment, that the environment variable ``STYLEEXP_PLUGINS`` names::
 
     STYLEEXP_PLUGINS="renderer=my_module:MY_RENDERER, field=my_module:MY_FIELD"
 
-Specs are loaded once, when they are first asked for. One that can't be loaded stops nothing until
-it is chosen. Of plugins with the same name none is taken; built-in names are never given away.
+Specs are loaded once, on first use. One that fails to load raises an error only when chosen. If
+several plugins have the same name, none is used; built-in names can't be overridden.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from styleexp.renderers.specs import RENDERERS
 
 VARIABLE = "STYLEEXP_PLUGINS"
 OWN = "styleexp"
-"""Origin of what is built in."""
+"""Origin of built-in parts."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +47,10 @@ class Kind:
     """A kind of part that has plugins."""
 
     group: str
-    """Of entry points."""
+    """Entry-point group."""
     built_in: Mapping[str, Spec]
     base: type | None = None
-    """What the dataclass of options derives from: its keys are read outside of the part, too."""
+    """Required base of the options dataclass, if its keys are also read outside the part."""
 
 
 KINDS = {
@@ -66,25 +66,25 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Choice:
-    """One name of one kind: whose it is, and why it can't be used where it can't."""
+    """One name of one kind: its origin, and why it can't be used, if so."""
 
     kind: str
-    """A key of `KINDS`; something else if the plugin names no such kind."""
+    """A key of `KINDS`, or any other text if the plugin declares an unknown kind."""
     name: str
     origin: str
-    """``styleexp``, or the distribution or variable with what it names."""
+    """``styleexp``, or the distribution or environment variable with its entry."""
     version: str | None = None
     distribution: str | None = None
     loaded: Spec | None = None
     fault: str | None = None
-    """Why there is no spec, or why it is refused."""
+    """Why the spec is missing or refused."""
     error: BaseException | None = field(default=None, compare=False, repr=False)
     ceded: bool = False
-    """Refused because something that is no plugin has its name, and keeps it."""
+    """Refused because a built-in part or an asset has the same name."""
 
     @property
     def spec(self) -> Spec:
-        """The spec; a `UserError` where there is none, or it was refused."""
+        """The spec. Raises `UserError` if it is missing or refused."""
         if self.loaded is None or self.fault:
             raise UserError(f"the {self.kind} '{self.name}' can't be used: {self.fault}.") from (
                 self.error
@@ -93,7 +93,7 @@ class Choice:
 
     @property
     def reason(self) -> str | None:
-        """Why it can't be used here, packages that it lacks included; None if it can."""
+        """Why it can't be used here, including missing packages; None if it can."""
         if self.fault or self.loaded is None:
             return self.fault
         missing = [name for name in self.loaded.requires if not _importable(name)]
@@ -106,22 +106,22 @@ class Choice:
 
 
 def everything() -> tuple[Choice, ...]:
-    """All parts of all kinds, built-in ones first, with those that can't be used."""
+    """All parts of all kinds, built-in ones first, including unusable ones."""
     return _everything(os.environ.get(VARIABLE, ""))
 
 
 def names(kind: str) -> list[str]:
-    """The names of a kind that have a usable spec."""
+    """Names of a kind with a valid spec."""
     return [c.name for c in everything() if c.kind == kind and not c.fault]
 
 
 def known(kind: str, name: str | None) -> bool:
-    """Whether a part goes by that name, usable or not."""
+    """Whether a part of that name exists, usable or not."""
     return any((c.kind, c.name, c.ceded) == (kind, name, False) for c in everything())
 
 
 def find(kind: str, name: str) -> Choice:
-    """The part of that name; a `UserError` if it is unknown, could not be loaded or is refused."""
+    """The part of that name. Raises `UserError` if it is unknown, failed to load or is refused."""
     for choice in everything():
         if (choice.kind, choice.name, choice.ceded) == (kind, name, False):
             choice.spec  # noqa: B018  raises
@@ -130,14 +130,14 @@ def find(kind: str, name: str) -> Choice:
 
 
 def warn_of_rivals(kind: str, name: str | None) -> None:
-    """Warn that a plugin was refused the name that was chosen, and who has it."""
+    """Warn if a plugin was refused the chosen name, and say what has it."""
     for choice in everything():
         if choice.ceded and (choice.kind, choice.name) == (kind, name):
             warnings.warn(f"{kind}={name}: {choice.fault}.", stacklevel=2)
 
 
 def used(config: Any) -> list[dict[str, str | None]]:
-    """The plugins that a configuration names, for a run's record."""
+    """The plugins that a configuration uses, for a run's record."""
 
     def named(kind: str) -> Iterable[str | None]:
         part = getattr(config, kind, None)
@@ -151,7 +151,8 @@ def used(config: Any) -> list[dict[str, str | None]]:
 
 
 def usable(kind: str, name: str) -> Choice:
-    """The part of that name; a `UserError` if it can't be used here, a missing package included."""
+    """The part of that name. Raises `UserError` if it can't be used here, e.g. for a missing
+    package."""
     choice = find(kind, name)
     if choice.reason:
         raise UserError(f"the {kind} '{name}' can't be used: {choice.reason}.")
@@ -159,9 +160,9 @@ def usable(kind: str, name: str) -> Choice:
 
 
 def build(kind: str, options: Any, **given: Any) -> Any:
-    """Build the part that ``options.name`` names; ``given`` is what its kind needs (see `Spec`).
+    """Build the part named ``options.name``; ``given`` are the arguments of its kind (see `Spec`).
 
-    Raises `UserError` for a name that can't be used, and for whatever a plugin's factory raises.
+    Raises `UserError` for an unusable name, and for any exception of a plugin's factory.
     """
     name = getattr(options, "name", None)
     if name is None:
@@ -175,8 +176,8 @@ def build(kind: str, options: Any, **given: Any) -> Any:
         if choice.origin == OWN:
             raise
         raise UserError(
-            f"the {kind} '{name}' of {choice.origin} failed: {_told(error)} (debug=true shows "
-            "where)."
+            f"the {kind} '{name}' of {choice.origin} failed: {_told(error)} (debug=true shows the "
+            "traceback)."
         ) from error
 
 
@@ -199,7 +200,7 @@ def _everything(variable: str) -> tuple[Choice, ...]:
         key = plugin.kind, plugin.name
         origins = [each.origin for each in plugins if (each.kind, each.name) == key]
         if key in owners:
-            told = f"{owners[key]} has that name, {plugin.origin} can't have it"
+            told = f"{owners[key]} has that name already, so {plugin.origin} can't use it"
             plugin = replace(plugin, fault=told, error=None, ceded=True)
         elif len(origins) > 1:
             told = f"{' and '.join(origins)} have the same name: keep only one of them"
@@ -209,12 +210,12 @@ def _everything(variable: str) -> tuple[Choice, ...]:
 
 
 def _installed() -> Iterator[Choice]:
-    """What installed distributions name. Of those found twice on the path the first counts."""
+    """Plugins of installed distributions. If one is on the path twice, the first counts."""
     seen = set()
     for distribution in importlib.metadata.distributions():
         try:
             text = distribution.read_text("entry_points.txt") or ""
-        except Exception:  # not ours to judge: it may be any distribution
+        except Exception:  # may be any distribution, with any fault
             continue
         if "[styleexp." not in text:
             continue
@@ -240,9 +241,9 @@ def _installed() -> Iterator[Choice]:
 
 
 def _named_by(variable: str) -> Iterator[Choice]:
-    """What `VARIABLE` names. Who sets it wants it: what fails is told at once."""
+    """Plugins named by `VARIABLE`. The user set it on purpose, so failures are reported at once."""
     if variable and os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # as ``python -m`` does; a script's path lacks it
+        sys.path.append(os.getcwd())  # as ``python -m`` does; scripts don't have it
     for item in re.split(r"[,\s]+", variable.strip()) if variable.strip() else ():
         kind, _, value = item.partition("=")
         module, _, attribute = value.partition(":")
@@ -272,10 +273,10 @@ def _load(
     distribution: str | None,
     load: Callable[[], object],
 ) -> Choice:
-    """Load a spec and look it over; ``name`` None takes the spec's own."""
+    """Load and check a spec; with ``name`` None, use the spec's own name."""
     choice = Choice(kind, name or origin, origin, version, distribution)
     try:
-        with redirect_stdout(sys.stderr):  # what it prints must not get into --json
+        with redirect_stdout(sys.stderr):  # keep its output out of --json
             spec = load()
             fault = _fault(kind, name, spec)
     except (Exception, SystemExit) as error:
@@ -287,16 +288,16 @@ def _load(
 
 
 def _fault(kind: str, name: str | None, spec: object) -> str | None:
-    """What is wrong with what a plugin calls its spec."""
+    """What is wrong with a plugin's spec; None if it is valid."""
     if not isinstance(spec, Spec):
         return f"is of type {type(spec).__name__}, not styleexp.registry.Spec"
     if not re.fullmatch(r"\w[\w-]*", spec.name):
-        return f"has the name '{spec.name}': letters, digits, _ and - make a name"
+        return f"has the name '{spec.name}': use letters, digits, _ and - only"
     if name is not None and spec.name != name:
-        return f"is named '{spec.name}', its entry point '{name}'"
+        return f"is named '{spec.name}', but its entry point is '{name}'"
     config, base = spec.config, KINDS[kind].base
     if not (isinstance(config, type) and is_dataclass(config)):
-        return "has a config that is no dataclass"
+        return "has a config that is not a dataclass"
     if base is not None and not issubclass(config, base):
         return f"has the config {config.__name__}, which does not derive from {base.__name__}"
     if "name" not in {each.name for each in fields(config)}:
@@ -315,6 +316,6 @@ def _importable(name: str) -> bool:
 
 
 def _told(error: BaseException) -> str:
-    """The error in one line."""
+    """The error on one line."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return f"{type(error).__name__}: {': '.join(lines)}" if lines else type(error).__name__

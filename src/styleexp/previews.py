@@ -1,7 +1,7 @@
-"""Pictures of a finished run: ``preview.png`` and ``turntable.gif``. Never seen by gradients.
+"""Pictures of a finished run: ``preview.png`` and ``turntable.gif``. Not used in optimisation.
 
-With ``preview=pyrender`` there is a check view, too: the result as another renderer, in another
-process, draws it, so that a fault of the renderer that the result was made with can't hide.
+``preview=pyrender`` adds a check view: the result drawn by an independent renderer in another
+process, so that faults of the training renderer can't go unnoticed.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ VIEWS = (
 
 SUPERSAMPLING = 2
 LIGHT = (0.35, 0.45, 0.62)
-"""Camera space: from above right, so that relief throws shade."""
+"""Light direction in camera space, from above right, so that relief is shaded."""
 
 CHECK_PLATFORMS = ("egl", "osmesa")
-"""How pyrender gets at OpenGL without a display, the first choice first."""
+"""Headless OpenGL platforms for pyrender, in order of preference."""
 CHECK_TIMEOUT = 600
 """Seconds after which a check view counts as hung."""
 LEAST_IOU = 0.98
-"""Silhouettes that agree less than this are worth a warning."""
+"""Silhouette IoU below which a warning is issued."""
 
 
 def render_views(
@@ -63,7 +63,7 @@ def render_views(
     azimuths: list[float],
     size: int,
 ) -> np.ndarray:
-    """Pictures (views, size, size), 8-bit grey, of a mesh in the unit sphere, framed tightly."""
+    """Render a mesh in the unit sphere, tightly framed, as 8-bit grey (views, size, size)."""
     shading = Shading(albedo=0.8, ambient=0.22, light=LIGHT, background=1.0, normals="smooth")
     points = torch.from_numpy(np.ascontiguousarray(vertices)).float()
     cameras = framed(points, elevations, azimuths)
@@ -83,7 +83,8 @@ def render_views(
 def framed(
     points: Float[torch.Tensor, "vertices 3"], elevations: list[float], azimuths: list[float]
 ) -> Cameras:
-    """Cameras around the origin, angles in degrees, zoomed alike so that all points just fit."""
+    """Cameras around the origin, angles in degrees, with one common zoom that just fits all
+    points."""
     radians = math.pi / 180
     cameras = orbit(torch.tensor(elevations) * radians, torch.tensor(azimuths) * radians, 3.0, 40.0)
     seen = torch.einsum("nij,vj->nvi", cameras.rotation, points) + cameras.translation[:, None]
@@ -92,7 +93,7 @@ def framed(
 
 
 def write_preview(result: Result, path: Path) -> None:
-    """Source, style and result, four views each, labelled; an image style is shown as it is."""
+    """Draw source, style and result, four labelled views each; an image style is shown as is."""
     scene, size = result.scene, result.scene.config.preview.resolution
     elevations, azimuths = [v[1] for v in VIEWS], [v[2] for v in VIEWS]
 
@@ -116,7 +117,7 @@ def write_preview(result: Result, path: Path) -> None:
 
 
 def write_turntable(result: Result, path: Path) -> None:
-    """The result turning once, as an animated GIF."""
+    """Draw one turn of the result, as an animated GIF."""
     preview = result.scene.config.preview
     frames = preview.turntable_frames
     azimuths = [360.0 * i / frames for i in range(frames)]
@@ -129,16 +130,16 @@ def write_turntable(result: Result, path: Path) -> None:
 
 @dataclass(frozen=True)
 class CheckView:
-    """What pyrender drew."""
+    """Pictures drawn by pyrender."""
 
     pictures: np.ndarray
-    """(views, size, size), 8-bit grey, by pyrender's own light."""
+    """(views, size, size), 8-bit grey, with pyrender's lighting."""
     covered: np.ndarray
     """(views, size, size), bool."""
     platform: str
     """``egl`` or ``osmesa``."""
     device: str
-    """What OpenGL drew with: a GPU, or ``llvmpipe ...``."""
+    """OpenGL device: a GPU, or ``llvmpipe ...``."""
 
 
 def check_views(
@@ -148,9 +149,9 @@ def check_views(
     size: int,
     platform: str = "auto",
 ) -> CheckView:
-    """Draw a mesh with pyrender, in a process of its own.
+    """Draw a mesh with pyrender in a separate process.
 
-    ``platform`` is ``egl``, ``osmesa`` or ``auto``, EGL or else OSMesa. Raises ``UserError`` where
+    ``platform`` is ``egl``, ``osmesa`` or ``auto`` (EGL, else OSMesa). Raises ``UserError`` if
     pyrender is not installed, no platform works, or the process fails or hangs.
     """
     if importlib.util.find_spec("pyrender") is None:
@@ -183,7 +184,7 @@ def check_views(
 
 
 def _run_check(job: dict[str, Any], folder: Path, platform: str) -> str | None:
-    """Run a job's process, whose output is then ``out.npz``; or the reason why it can't be."""
+    """Run a job's process, which writes ``out.npz``. Returns the reason if it fails."""
     np.savez(folder / "in.npz", **job)
     command = [sys.executable, "-m", "styleexp.check_view"]
     try:
@@ -205,7 +206,7 @@ def _run_check(job: dict[str, Any], folder: Path, platform: str) -> str | None:
 
 
 def check_available(platform: str = "auto") -> None:
-    """Raise ``check_views``' ``UserError`` now rather than at the end of a run."""
+    """Raise ``check_views``'s ``UserError`` now instead of at the end of a run."""
     corners = torch.eye(3)
     check_views(
         corners.numpy(), np.array([[0, 1, 2]]), framed(corners, [20.0], [40.0]), 32, platform
@@ -220,9 +221,9 @@ def silhouette_iou(
     renderer: Renderer,
     device: torch.device | str = "cpu",
 ) -> tuple[list[float], np.ndarray]:
-    """How far a renderer's silhouettes agree with ``covered`` (views, size, size), bool.
+    """Agreement of a renderer's silhouettes with ``covered`` (views, size, size), bool.
 
-    Returns the intersection over the union of every view, and this renderer's pixels.
+    Returns the IoU of every view, and this renderer's covered pixels.
     """
     cameras = replace(
         cameras,
@@ -245,11 +246,11 @@ def silhouette_iou(
 
 
 def write_check(result: Result, write: Callable[[str, Callable[[Path], Any]], Path]) -> list[Path]:
-    """``check.png``, ``check.gif`` and ``check.json``: the result as pyrender draws it.
+    """Write ``check.png``, ``check.gif`` and ``check.json``: the result drawn by pyrender.
 
     ``write`` is ``RunFolder.write``. The training renderer's silhouettes are compared with
-    pyrender's at the same cameras; intersections over unions are in ``check.json``, and one below
-    ``LEAST_IOU`` is a warning. Returns the files' paths.
+    pyrender's at the same cameras; ``check.json`` holds the IoUs, and one below ``LEAST_IOU``
+    issues a warning. Returns the files' paths.
     """
     scene, preview = result.scene, result.scene.config.preview
     faces = scene.source.faces
@@ -261,7 +262,7 @@ def write_check(result: Result, write: Callable[[str, Callable[[Path], Any]], Pa
     cameras = framed(points, elevations, azimuths)
     if isinstance(scene, Scene):
         renderer = scene.viewer.renderer
-    else:  # a baseline's, which may need none
+    else:  # a baseline may have no renderer
         renderer = plugins.build("renderer", scene.config.renderer)
     size, views = preview.check_resolution, slice(0, len(VIEWS))
     drawn = check_views(vertices, faces, cameras, size, preview.platform)
@@ -288,8 +289,8 @@ def write_check(result: Result, write: Callable[[str, Callable[[Path], Any]], Pa
     if min(ious) < LEAST_IOU:
         warnings.warn(
             "the result looks different in the check view: its silhouette seen from the "
-            f"{VIEWS[ious.index(min(ious))][0]} agrees with {name}'s to {min(ious):.3f} (IoU), "
-            f"{LEAST_IOU} is expected; see check.png.",
+            f"{VIEWS[ious.index(min(ious))][0]} has an IoU of {min(ious):.3f} with {name}'s, "
+            f"expected at least {LEAST_IOU}; see check.png.",
             stacklevel=2,
         )
     agreed = ", ".join(f"{iou:.4f}" for iou in ious)
@@ -317,7 +318,7 @@ def _write_gif(pictures: np.ndarray, path: Path) -> None:
 
 
 def sheet(rows: list[tuple[str, list[Image.Image]]], size: int) -> Image.Image:
-    """Labelled rows of pictures, none larger than ``size``, under each other."""
+    """Stack labelled rows of pictures, none larger than ``size``."""
     band = max(18, size // 12)
     font = ImageFont.load_default(size=band * 0.62)
     columns = max(len(pictures) for _, pictures in rows)

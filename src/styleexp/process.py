@@ -1,4 +1,4 @@
-"""What belongs to the whole process: threads, and the global generators of random numbers."""
+"""Process-wide state: threads, and the global random number generators."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ if TYPE_CHECKING:
 
 
 def prepare(config: Config) -> None:
-    """Set threads and global generators as a run wants them, whatever was before it.
+    """Set threads and global generators for a run, independent of earlier state.
 
-    Our own parts draw from generators of their own; a plugin's may not. Mitsuba's variant is set in
-    every call of its renderer.
+    Built-in parts use their own generators; plugins may not. Mitsuba's variant is set in every call
+    of its renderer.
     """
     import numpy as np
     import torch
 
-    default = _default_threads()  # before it is changed
+    default = _default_threads()  # read before it changes
     threads = config.threads or default
     torch.set_num_threads(threads)
     if "drjit" in sys.modules:
@@ -47,9 +47,9 @@ _restore: list[Callable[[], None]] = []
 
 @contextmanager
 def undisturbed(config: Config) -> Iterator[None]:
-    """`prepare`, and put everything back at the end.
+    """`prepare`, and restore everything on exit.
 
-    Of several threads that do so at once the first one's state is put back by the last.
+    With concurrent threads, the last one to exit restores the state that the first one saved.
     """
     global _guests, _restore
     with _LOCK:
@@ -68,7 +68,7 @@ def undisturbed(config: Config) -> Iterator[None]:
 
 
 def _kept() -> list[Callable[[], None]]:
-    """What puts the present state back."""
+    """Functions that restore the current state."""
     import numpy as np
     import torch
 

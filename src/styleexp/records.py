@@ -1,6 +1,6 @@
-"""A run's folder: its status, its record, its metrics, its checkpoints.
+"""A run's folder: status, record, metrics and checkpoints.
 
-Every file but ``metrics.jsonl``, which grows by a line a step, is written whole or not at all.
+Every file is written atomically, except ``metrics.jsonl``, which grows by one line per step.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ FILES = (
     "mlflow.json",
     "run.json",
 )
-"""What a run may leave in its folder; the record last, by which it is known as a run's."""
+"""Files that a run may leave in its folder. The record, which marks a run's folder, is last."""
 
 PACKAGES = (
     "styleexp",
@@ -64,7 +64,7 @@ class RunFolder:
 
     path: Path
     begun: bool = False
-    """Whether what it holds is the run's that this process is at."""
+    """Whether the folder's content belongs to this process's run."""
 
     @property
     def checkpoint(self) -> Path:
@@ -73,29 +73,29 @@ class RunFolder:
 
     @property
     def metrics(self) -> Path:
-        """One JSON line a step."""
+        """One JSON line per step."""
         return self.path / "metrics.jsonl"
 
     def write_status(self, status: str, **more: Any) -> None:
-        """``status.json``: "running", "done", "interrupted" or "failed", with the reason."""
+        """Write ``status.json``: "running", "done", "interrupted" or "failed", with the reason."""
         self.write_json("status.json", {"schema": SCHEMA, "status": status, "time": now(), **more})
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        """Write a JSON file whole."""
+        """Write a JSON file atomically."""
         self.write(name, atomic.text(json.dumps(content, indent=2, default=str) + "\n"))
 
     def write(self, name: str, writer: Callable[[Path], Any]) -> Path:
-        """Let ``writer`` write a file, whole or not at all."""
+        """Let ``writer`` write a file, atomically."""
         return atomic.write(self.path / name, writer)
 
     def unfinished(self, record: Mapping[str, Any]) -> dict[str, Any] | None:
-        """The record of this folder's run if it is the same as ``record``'s and not done."""
+        """The record of this folder's run, if it is the same run as ``record`` and not done."""
         path = self.path / "run.json"
         try:
             before = json.loads(path.read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return None
-        if told := too_new(before):  # it must not be written over
+        if told := too_new(before):  # must not be overwritten
             raise UserError(f"cannot run in '{self.path}': {told}")
         try:
             status = json.loads((self.path / "status.json").read_text(encoding="utf-8"))
@@ -105,7 +105,7 @@ class RunFolder:
         return before if same else None
 
     def begin(self, record: Mapping[str, Any] | None) -> None:
-        """Note that a run is at work here: a new one with this record, or the one of before."""
+        """Mark the folder as running: a new run with this record, or (None) the previous one."""
         if record is not None:
             self.clear()
         self.write_status("running")
@@ -114,34 +114,34 @@ class RunFolder:
         self.begun = True
 
     def clear(self) -> None:
-        """Remove what an earlier run left, lest it be taken for the next one's."""
+        """Remove an earlier run's files, so that they aren't mistaken for the next run's."""
         if (self.path / "run.json").exists():
             for name in FILES:
                 (self.path / name).unlink(missing_ok=True)
             shutil.rmtree(self.path / "tensorboard", ignore_errors=True)
 
     def forget(self) -> None:
-        """Remove the checkpoints: the run is to begin anew."""
+        """Remove the checkpoints, to restart the run."""
         for path in (self.checkpoint, self.path / "checkpoint.previous.safetensors"):
             with suppress(OSError):
                 path.unlink()
 
     def check(self) -> None:
-        """``FileNotFoundError`` where somebody removed what the run wrote while it was at work."""
+        """Raise ``FileNotFoundError`` if the run's files were removed while it was running."""
         for name in ("run.json", "result.ply"):
             (self.path / name).stat()
 
     def append_metrics(self, step: Step) -> None:
-        """Add a step's line. ``FileNotFoundError`` where somebody removed those before it."""
+        """Append a step's line. Raises ``FileNotFoundError`` if earlier lines were removed."""
         create = os.O_CREAT if step.step == 1 else 0
         descriptor = os.open(self.metrics, os.O_WRONLY | os.O_APPEND | create, 0o666)
         with open(descriptor, "a", encoding="utf-8") as lines:
             lines.write(json.dumps(asdict(step)) + "\n")
 
     def begin_metrics(self, step: int) -> int:
-        """Keep the lines of the steps up to ``step``: a resumed run will write the others again.
+        """Keep the lines of steps up to ``step``; a resumed run writes the others again.
 
-        Returns how many of those that should be there are lost.
+        Returns the number of missing lines.
         """
         if not step:
             self.metrics.unlink(missing_ok=True)
@@ -159,7 +159,7 @@ class RunFolder:
         return step - len(kept)
 
     def save_checkpoint(self, state: State) -> None:
-        """Field, optimiser and step in one safetensors file; the one before is kept beside it."""
+        """Save field, optimiser and step in one safetensors file, and keep the previous one."""
         from safetensors.torch import save
 
         tensors = {f"field.{k}": v.contiguous() for k, v in state.field.state_dict().items()}
@@ -174,12 +174,13 @@ class RunFolder:
         self.write("checkpoint.safetensors", atomic.data(content))
 
     def _sync_metrics(self) -> None:
-        """A checkpoint on the disk means that the lines of its steps are there, too."""
+        """Sync the metrics, so that a checkpoint on disk implies that the lines of its steps are
+        too."""
         with suppress(FileNotFoundError), open(self.metrics, "rb") as lines:
             os.fsync(lines.fileno())
 
     def checkpoint_step(self) -> int | None:
-        """The step of the latest checkpoint; None where there is none that can be read."""
+        """Step of the latest checkpoint; None if there is no readable one."""
         from safetensors import safe_open
 
         try:
@@ -189,10 +190,10 @@ class RunFolder:
             return None
 
     def load_checkpoint(self, state: State) -> str | None:
-        """Bring ``state`` to the latest whole checkpoint; returns what to tell the user.
+        """Load the latest intact checkpoint into ``state``; return a message for the user.
 
-        A damaged checkpoint is put aside for the one before it. With none, ``state`` stays as it
-        is, at step 0.
+        A damaged checkpoint is set aside and the previous one is used. Without any, ``state`` stays
+        at step 0.
         """
         begun, damaged = copy.deepcopy(state.field.state_dict()), []
         for path in (self.checkpoint, self.path / "checkpoint.previous.safetensors"):
@@ -204,16 +205,16 @@ class RunFolder:
             except Exception as damage:  # safetensors raises several kinds
                 state.field.load_state_dict(begun)
                 damaged.append(f"{path} is damaged ({first_line(damage)})")
-                if path == self.checkpoint:  # the next one saved must not take the good one's place
+                if path == self.checkpoint:  # the next save must not overwrite the good one
                     os.replace(path, self.path / "checkpoint.damaged.safetensors")
         if not damaged:
             return None
-        used = "the checkpoint before it is used" if state.step else "the run begins anew"
+        used = "using the previous checkpoint" if state.step else "restarting the run"
         return f"{', and '.join(damaged)}; {used}."
 
 
 def first_line(error: BaseException) -> str:
-    """What an exception says, in one line."""
+    """An exception's message on one line."""
     return (str(error).strip().splitlines() or [""])[0] or type(error).__name__
 
 
@@ -224,7 +225,7 @@ def _restore(path: Path, state: State) -> None:
         metadata = opened.metadata()
         step = int(metadata["step"])
         tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
-    # The first checkpoints had no digest.
+    # Checkpoints of early versions have no digest.
     if metadata.get("digest", "") not in ("", digests.of(tensors, metadata["step"])):
         raise ValueError("its content does not match its digest")
     device = next(state.field.parameters()).device
@@ -241,7 +242,7 @@ def _restore(path: Path, state: State) -> None:
 
 
 def describe(config: Any, overrides: list[str], command: list[str]) -> dict[str, Any]:
-    """What a reader needs to reproduce a run, apart from what the run itself finds out."""
+    """Everything needed to reproduce a run, except for what the run itself determines."""
     return {
         "schema": SCHEMA,
         "key": identity.job_key(config),
@@ -266,7 +267,7 @@ def _versions() -> dict[str, str | None]:
 
 
 def changed_versions(record: Mapping[str, Any]) -> str:
-    """Packages that a run was begun with in another version than this one's, or nothing."""
+    """Packages whose versions differ from those the run was started with; empty if none."""
     here = {"python": platform.python_version(), **_versions()}
     then = record.get("versions") or {}
     changed = [(name, old) for name, old in then.items() if name in here and old != here[name]]
@@ -274,23 +275,23 @@ def changed_versions(record: Mapping[str, Any]) -> str:
 
 
 def now() -> str:
-    """The time, UTC, ISO 8601."""
+    """Current time, UTC, ISO 8601."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def read_record(folder: Path, purpose: str = "resume") -> dict[str, Any]:
-    """The ``run.json`` of a folder; a `UserError` where there is none that can be read."""
+    """Read a folder's ``run.json``. Raises `UserError` if it is missing or unreadable."""
     path = folder / "run.json"
     if not path.is_file():
         raise UserError(
-            f"cannot {purpose} '{folder}': it has no run.json, so it is no run's folder."
+            f"cannot {purpose} '{folder}': it has no run.json, so it is not a run's folder."
         )
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
         if told := too_new(record):
             raise UserError(f"cannot {purpose} '{folder}': {told}")
         if not isinstance(record, dict):
-            raise ValueError("it holds no object")
+            raise ValueError("it is not a JSON object")
     except ValueError as error:
-        raise UserError(f"'{path}' cannot be read ({error}): start the run anew.") from error
+        raise UserError(f"'{path}' cannot be read ({error}): start the run again.") from error
     return record

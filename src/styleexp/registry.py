@@ -1,4 +1,5 @@
-"""Parts that are chosen by name: a name, its options, and a factory that imports it when used."""
+"""Specs of parts chosen by name: the name, its options, and a factory that imports the part
+lazily."""
 
 from __future__ import annotations
 
@@ -9,9 +10,9 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Spec:
-    """One choice of a kind of part, built in or a plugin's.
+    """One choice of a kind of part, built in or from a plugin.
 
-    What the factory is called with, and what ``config`` has to be:
+    Signature of the factory, and type of ``config``:
 
     - renderer: ``factory(options)``; any dataclass.
     - encoder: ``factory(options, device=, seed=)``; ``config.EncoderConfig`` or a subclass.
@@ -21,21 +22,22 @@ class Spec:
     - loss: ``factory(options, encoder=)``; ``config.LossConfig`` or a subclass.
     - baseline: ``factory(options)``; any dataclass. Returns a `baselines.Method`.
     - logger: ``factory(options, folder=, record=, step=)``; any dataclass. Returns a
-      `loggers.Logger` for the run of that folder, whose ``run.json`` is the record, from that step.
+      `loggers.Logger` for the run in that folder, whose ``run.json`` is ``record``, starting at
+      ``step``.
     """
 
     name: str
     description: str
     config: type
-    """Dataclass of its options, with a ``name`` field and a default for each; what Hydra validates
-    against."""
+    """Dataclass of its options, with a ``name`` field and defaults for all fields. Hydra validates
+    against it."""
     factory: Callable[..., Any]
-    """Builds the part from such options. Heavy imports belong inside."""
+    """Builds the part from an instance of ``config``. Do heavy imports inside."""
     requires: tuple[str, ...] = ()
-    """Top-level import names of packages that it needs and that may be missing."""
+    """Top-level import names of required packages that may be missing."""
     extra: str | None = None
-    """The extra of its own distribution that brings them."""
+    """Extra of its own distribution that installs them."""
     reads: tuple[str, ...] | None = None
-    """Of a baseline: the keys that it reads, besides its own options and what every run reads
-    (`styleexp.unread`); a key stands for all below it. A run says of the others that are given that
-    they have no effect. None: not known."""
+    """For a baseline: the keys it reads, besides its own options and those every run reads
+    (`styleexp.unread`). A key includes all keys below it. A run notes any other given key as having
+    no effect. None: unknown."""

@@ -1,4 +1,4 @@
-"""How high and how fine a mesh's or a picture's relief is, without any neural network."""
+"""Height and frequency of a mesh's or an image's relief, without neural networks."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ def mesh_relief(
     normals: Float[np.ndarray, "vertices 3"],
     length: float,
 ) -> Float[np.ndarray, " vertices"]:
-    """Height of each vertex over the mesh's own smoothed version, along its normal.
+    """Height of each vertex above the smoothed mesh, along its normal.
 
-    What is smaller than about ``length``, in the units of ``vertices``, counts as relief; see
-    ``smoother``. The heights' mean is zero.
+    Features smaller than about ``length``, in the units of ``vertices``, count as relief; see
+    ``smoother``. The heights have zero mean.
     """
     smooth = smoother(vertices, faces, length)(vertices)
     height = ((vertices - smooth) * normals).sum(axis=1)
@@ -31,9 +31,9 @@ def mesh_relief(
 def smoother(
     vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], length: float
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """A low-pass filter for what is given at the vertices, (vertices,) or (vertices, columns).
+    """Return a low-pass filter for per-vertex values, (vertices,) or (vertices, columns).
 
-    One implicit step of the graph Laplacian, which flattens what is smaller than about ``length``.
+    One implicit step of the graph Laplacian, which flattens features smaller than about ``length``.
     """
     from scipy.sparse import coo_matrix, diags
     from scipy.sparse.linalg import cg
@@ -42,10 +42,10 @@ def smoother(
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     both = np.concatenate([edges, edges[:, ::-1]])
     adjacency = coo_matrix((np.ones(len(both)), (both[:, 0], both[:, 1])), (count, count)).tocsr()
-    adjacency.data[:] = 1.0  # edges of two faces were counted twice
+    adjacency.data[:] = 1.0  # edges shared by two faces were counted twice
     degree = np.asarray(adjacency.sum(axis=1)).ravel().clip(min=1)
     edge = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1).mean()
-    # On an even mesh the graph Laplacian is about 3/2 edge^2 times the true one, whose eigenvalue
+    # On a uniform mesh the graph Laplacian is about 3/2 edge^2 times the true one, whose eigenvalue
     # for a wave of ``length`` is (2 pi / length)^2: such a wave is damped to a fifth.
     time = 4 * (length / (2 * np.pi * edge)) ** 2 / 1.5
     matrix = diags(1 + time * degree) - time * adjacency
@@ -56,12 +56,12 @@ def smoother(
         found = [cg(matrix, each, each, rtol=1e-9, M=inverse)[0] for each in columns]
         return np.stack(found, axis=1).reshape(np.shape(values))
 
-    # A factorisation takes fifty times as long on a fine mesh.
+    # A factorisation would take fifty times as long on a fine mesh.
     return smooth
 
 
 def half_range(height: Float[np.ndarray, " vertices"]) -> float:
-    """Half of the distance from the 1st to the 99th percentile."""
+    """Half the distance between the 1st and the 99th percentile."""
     low, high = np.percentile(height, [1, 99])
     return float(high - low) / 2
 
@@ -71,8 +71,8 @@ def mesh_frequency(
     vertices: Float[np.ndarray, "vertices 3"],
     faces: Int[np.ndarray, "faces 3"],
 ) -> float:
-    """Cycles per unit length of a height on a mesh: the root mean square slope over the root mean
-    square height, which for a sine wave is 2 pi times its frequency."""
+    """Frequency of a height on a mesh, in cycles per unit length: RMS slope / RMS height / 2 pi,
+    which is exact for a sine wave."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     cross = np.cross(b - a, c - a)
     double = np.linalg.norm(cross, axis=1).clip(min=1e-30)
@@ -86,7 +86,7 @@ def mesh_frequency(
 
 
 def picture_frequency(picture: Float[np.ndarray, "height width"]) -> float:
-    """The same for a picture's tone, in cycles per longer side."""
+    """Frequency of an image's tone, in cycles per longer side; see `mesh_frequency`."""
     tone = picture - picture.mean()
     rows, columns = np.gradient(tone)
     frequency = _frequency((rows**2 + columns**2).sum(), (tone**2).sum())

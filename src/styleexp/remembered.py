@@ -1,9 +1,9 @@
-"""Target Gram matrices of earlier runs, so that a run like one before starts its steps sooner.
+"""Cache of target Gram matrices, so that a run similar to an earlier one starts sooner.
 
-Measuring the style, and the source as it is, takes as long as a dozen steps, and most runs of a
-study share it. A file is found by a digest of all that went into it: meshes, options, weights, the
-code itself, torch, threads. What it holds are the bits that would be computed; where there is none,
-or it can't be read, they are.
+Measuring the style and the source takes as long as a dozen steps, and most runs of a study share
+it. Cache files are keyed by a digest of all inputs: meshes, options, weights, the code itself, the
+torch version, threads. Cached values are bit-identical to computed ones. If a file is missing or
+unreadable, the values are computed.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ if TYPE_CHECKING:
     from styleexp.losses import Grams
 
 KEPT = 40
-"""Files, of 5 MB each; the longest unused go first."""
+"""Maximum number of files, about 5 MB each; the least recently used are evicted."""
 
 
 def grams(
     config: Config, encoder: Encoder, about: list[object], make: Callable[[], tuple[Grams, Grams]]
 ) -> tuple[Grams, Grams]:
-    """What ``make`` returns, from the cache if it was made before.
+    """Return ``make()``, cached on disk.
 
-    ``about`` is what else it depends on: tensors, or what ``repr`` tells apart. Parts from plugins,
-    whose code isn't ours to know, are always made anew.
+    ``about`` holds its other inputs: tensors, or objects that ``repr`` distinguishes. Results that
+    involve plugins, whose code can't be hashed, are never cached.
     """
     parts = (("renderer", config.renderer), ("encoder", config.encoder), ("loss", config.loss))
     own = all(plugins.find(kind, part.name).origin == plugins.OWN for kind, part in parts)
@@ -68,7 +68,7 @@ def _digest(config: Config, encoder: Encoder, about: list[object]) -> str:
 
 @cache
 def _code() -> bytes:
-    """Of every module of the package: which of them matter would have to be kept up to date."""
+    """Digest of all modules of the package; a list of the relevant ones would need maintenance."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.rglob("*.py")):
         digest.update(path.read_bytes())
@@ -86,7 +86,7 @@ def _read(path: Path, encoder: Encoder) -> tuple[Grams, Grams] | None:
         return None
     if digests.of(tensors) != told:
         return None
-    with suppress(OSError):  # a cache that is read-only
+    with suppress(OSError):  # read-only cache
         os.utime(path)
     ordered = [(name, tensors[name].to(encoder.mean.device)) for name in sorted(tensors)]
     whole, local = ([t for n, t in ordered if n.startswith(k)] for k in ("global", "local"))
@@ -100,7 +100,7 @@ def _write(path: Path, found: tuple[Grams, Grams]) -> None:
     for kind, each in zip(("global", "local"), found, strict=True):
         tensors |= {f"{kind}.{i:02d}": gram.contiguous().cpu() for i, gram in enumerate(each)}
     content = save(tensors, {"digest": digests.of(tensors)})
-    with suppress(OSError):  # a run needs no cache
+    with suppress(OSError):  # the cache is optional
         path.parent.mkdir(parents=True, exist_ok=True)
         atomic.sweep(path.parent, seconds=atomic.A_DAY)
         atomic.write(path, atomic.data(content))

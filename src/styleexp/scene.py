@@ -1,7 +1,7 @@
-"""All that stays fixed while the field learns: meshes, renderer, encoder, views, and the target.
+"""Everything that stays fixed during optimisation: meshes, renderer, encoder, views and target.
 
-`Subject` is the part of it that every method needs, the baselines included; `Scene` adds what the
-style loss needs.
+`Subject` is the part that every method needs, including the baselines; `Scene` adds what the style
+loss needs.
 """
 
 from __future__ import annotations
@@ -42,30 +42,30 @@ if TYPE_CHECKING:
 
 
 BOUND_MARGIN = 2.0
-"""How much farther than the style's own relief the displacement may reach."""
+"""Displacement bound as a multiple of the style's own relief."""
 
 PICTURE_STEEPNESS = 0.15
-"""Half the range of a picture's relief, in its own wavelengths: a picture doesn't tell its height.
-Of the analytic styles it is 0.10 to 0.16."""
+"""Assumed half range of an image's relief, in wavelengths, since an image doesn't determine its
+height. The analytic styles have 0.10 to 0.16."""
 
 PICTURE_DETAIL = 128
-"""Pixels on a picture's longer side when its frequency is measured; finer detail doesn't count."""
+"""Longer side, in pixels, at which an image's frequency is measured; finer detail is ignored."""
 
 
 PER_WAVE = 12.0
-"""Of the longest edges, on a wavelength of the style's relief, where the source is refined: with
-half as many the grooves between bubbles are blurred."""
+"""Number of longest edges per wavelength of the style's relief when refining the source; half as
+many blur the grooves between bubbles."""
 MOST_REFINED = 200_000
-"""Faces that refining aims at, at most."""
+"""Maximum number of faces that refining aims for."""
 SHORTER = 0.65
-"""Mean edge over the longest after refining, which halves edges."""
+"""Ratio of mean to longest edge after refining, which halves edges."""
 STRAY = 5.0
-"""A mesh has stray faces where a vertex is so many times farther off than 99 of 100 vertices."""
+"""Distance of a vertex, as a multiple of the 99th percentile, above which its faces are stray."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Subject:
-    """What a run is about. Tensors are in the normalised source's frame."""
+    """Inputs of a run that every method needs. Tensors are in the normalised source's frame."""
 
     config: Config
     source: meshes.Mesh
@@ -75,48 +75,49 @@ class Subject:
     surface: Surface
     areas: Float[Tensor, " vertices"]
     unit: float
-    """How large a pattern of size 1 is on the normalised source: see `pattern_unit`."""
+    """Size of a unit pattern on the normalised source; see `pattern_unit`."""
     sigma: float
-    """Of the Fourier features, in cycles per radius of the normalised source."""
+    """Standard deviation of the Fourier frequencies, in cycles per radius of the normalised
+    source."""
     bound: float
     """Displacements lie in (-bound, bound), in radii of the normalised source."""
     relief: float
-    """Half the range of the style's own relief, in such radii."""
+    """Half the range of the style's own relief, in radii of the normalised source."""
     heights: Heights | None = None
-    """Of a picture; None for a mesh."""
+    """Heights of an image style; None for a mesh."""
     example: MeshExemplar | None = None
-    """Of a mesh, for the method that lays the relief by example."""
+    """Exemplar of a mesh style, for ``method=synthesis``."""
     smooth: bool = False
-    """Whether that method found no relief on the style."""
+    """Whether ``method=synthesis`` found no relief on the style."""
     mask: Float[Tensor, " vertices"] | None = None
     """Factor on the displacement, 0 to 1 (``style.mask``); None is 1 everywhere."""
     notes: tuple[str, ...] = ()
-    """What the user should know: repairs, a mesh too coarse for the style."""
+    """Notes for the user, such as repairs or a mesh too coarse for the style."""
 
     @property
     def weights(self) -> Float[Tensor, " vertices"]:
-        """The area that each vertex counts for in means over the surface that gets relief."""
+        """Area weight of each vertex in means over the surface that gets relief."""
         return self.areas if self.mask is None else self.areas * self.mask
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scene(Subject):
-    """What a run optimises in: what the style loss needs, besides."""
+    """A `Subject` with everything that the style loss needs."""
 
     viewer: Viewer
     loss: StyleLoss
     target: StyleTarget
     base: Float[Tensor, " vertices"] | None
-    """What the field's displacement is added to (``field.start``); None is nothing."""
+    """Base displacement that the field adds to (``field.start``); None is zero."""
     scales: tuple[list[Tensor], list[Tensor]]
-    """What the distances of the global and the local views are divided by, for each layer."""
+    """Divisors of the distances of global and local views, per layer."""
 
 
 def load(
     config: Config, relief_of: Callable[[meshes.Mesh], MeshExemplar | None] | None = None
 ) -> Subject:
-    """Load source and style, and measure the style. ``relief_of`` tells a style mesh's relief from
-    its shape, None where there is none; the source is then refined for that relief."""
+    """Load source and style, and measure the style. ``relief_of`` separates a style mesh's relief
+    from its shape (None if it has no relief); the source is then refined for that relief."""
     check(config)
     device = choose_device(config.device)
     source = load_source(config.source)
@@ -129,7 +130,7 @@ def load(
     size = 1.0 if config.style.scale_by == "frame" else unit
     example, smooth = None, False
     if relief_of is not None and isinstance(style, meshes.Mesh):
-        doing("telling the style's relief from its shape")
+        doing("separating the style's relief from its shape")
         example = relief_of(style)
         smooth = example is None
         if example is not None and config.field.sigma is None:
@@ -174,19 +175,19 @@ def load(
 
 
 def heights_of(config: Config, style: meshes.Mesh | np.ndarray) -> Heights | None:
-    """A picture's heights; None for a mesh, of which the keys that say how to read pictures, where
-    they are given, are refused."""
+    """Heights of an image style; None for a mesh, for which options that only apply to images are
+    refused."""
     if isinstance(style, np.ndarray):
         if config.style.relief_length is not None:
             raise UserError(
-                f"style.relief_length={config.style.relief_length} parts the shape of a style mesh "
-                "from its relief, and the style is a picture: leave it out."
+                f"style.relief_length={config.style.relief_length} separates a style mesh's relief "
+                "from its shape, but the style is a picture: leave it out."
             )
         return pictures.picture_height(config, style)
     for key, plain in (("kind", "auto"), ("invert", False), ("image_depth", None)):
         if (value := getattr(config.style, key)) != plain:
             raise UserError(
-                f"style.{key}={str(value).lower()} says how to read a picture, and the style "
+                f"style.{key}={str(value).lower()} only applies to pictures, but the style "
                 f"'{style.name}' is a mesh: leave it out."
             )
     return None
@@ -195,12 +196,13 @@ def heights_of(config: Config, style: meshes.Mesh | np.ndarray) -> Heights | Non
 def placed(
     config: StyleConfig, source: meshes.Mesh, areas: Float[Tensor, " vertices"]
 ) -> tuple[Float[Tensor, " vertices"] | None, list[str]]:
-    """``style.mask`` at the source's vertices, and a note on how much of the surface it selects."""
+    """``style.mask`` at the source's vertices, and a note on the fraction of the surface it
+    selects."""
     if config.mask is None:
         return None, []
     mask = torch.from_numpy(masks.weights(config, source)).to(areas)
     share = float((areas * mask).sum() / areas.sum())
-    return mask, [f"the relief goes on {100 * share:.1f} % of the surface (style.mask)"]
+    return mask, [f"the relief covers {100 * share:.1f} % of the surface (style.mask)"]
 
 
 def prepare(config: Config) -> Scene:
@@ -211,7 +213,7 @@ def prepare(config: Config) -> Scene:
 
         relief_of = method.relief_of(config)
     subject = load(config, relief_of)
-    doing("laying the style's height map on the source")
+    doing("applying the style's height map to the source")
     base, told = start_of(subject)
     surface, style, unit = subject.surface, subject.style, subject.unit
     device = surface.vertices.device
@@ -227,7 +229,7 @@ def prepare(config: Config) -> Scene:
     viewer = Viewer(config, renderer, shading, surface, lights=lights)
 
     def measured(mesh: Surface, scale: float) -> styles.FixedTarget:
-        """Grams over a bank of views; those of a run with the same are still known."""
+        """Grams over a bank of views, cached across runs with the same inputs."""
         about = [mesh.vertices, mesh.faces, scale, lights, shading, str(device)]
 
         def make() -> tuple[Grams, Grams]:
@@ -259,10 +261,10 @@ def prepare(config: Config) -> Scene:
         if not any(bool(gram.any()) for part in grams for gram in part):
             mesh = subject.source if what == "source" else style
             if isinstance(mesh, meshes.Mesh) and (stray := stray_faces(what, mesh)):
-                raise UserError(f"the views see nothing of the {what}: {stray[0]}")
+                raise UserError(f"the views don't see the {what}: {stray[0]}")
             raise UserError(
-                f"the views see nothing of the {what}, no cell of any style layer is wholly its: "
-                "lower views.distance, or raise views.resolution and views.local.size."
+                f"the views don't see enough of the {what}: it fully covers no cell of any style "
+                "layer; lower views.distance, or raise views.resolution and views.local.size."
             )
     return Scene(
         **{**vars(subject), "notes": (*subject.notes, *told)},
@@ -275,7 +277,7 @@ def prepare(config: Config) -> Scene:
 
 
 def start_of(subject: Subject) -> tuple[Tensor | None, list[str]]:
-    """What the field is added to (``field.start``), and what to tell the user about it."""
+    """Base displacement of the field (``field.start``), and notes for the user."""
     if subject.config.field.start == "source" or subject.smooth:
         return None, []
     if subject.config.field.start == "synthesis":
@@ -293,9 +295,9 @@ def start_of(subject: Subject) -> tuple[Tensor | None, list[str]]:
 
 
 def pattern_unit(config: StyleConfig, source: meshes.Mesh, style: meshes.Mesh | None) -> float:
-    """How large a pattern of size 1 is on the normalised source: see ``StyleConfig.scale_by``.
+    """Size of a unit pattern on the normalised source; see ``StyleConfig.scale_by``.
 
-    An image (``style`` None) counts as if it lay on the unit sphere.
+    An image (``style`` None) is treated as covering the unit sphere.
     """
     if config.scale_by == "frame":
         return config.scale
@@ -310,8 +312,8 @@ def choose_field(
     heights: Heights | None = None,
     tile: float = 1.0,
 ) -> tuple[float, float, float]:
-    """sigma, bound and the half range of the relief, in the style's own radii: as configured, or
-    measured on the style, of which a picture comes with its ``heights`` and how large it lies
+    """sigma, bound and the half range of the relief, in radii of the style: as configured, or
+    measured on the style. An image style needs its ``heights`` and its size
     (``style.image_tile``)."""
     if heights is None:
         assert isinstance(style, meshes.Mesh)
@@ -330,8 +332,8 @@ def choose_field(
 
 
 def refined(mesh: meshes.Mesh, wavelength: float, how: str) -> meshes.Mesh:
-    """The mesh with edges short enough for a relief of this wavelength, in radii. ``how`` is
-    ``source.refine``: a number of faces that is aimed at, or ``auto``, at most `MOST_REFINED`."""
+    """Refine the mesh until its edges are short enough for a relief of this wavelength, in radii.
+    ``how`` is ``source.refine``: a target number of faces, or ``auto``, at most `MOST_REFINED`."""
     scale = meshes.normalisation(mesh.vertices).scale
     area = meshes.face_areas(mesh.vertices, mesh.faces).sum()
     faces = MOST_REFINED if how == "auto" else float(how)
@@ -339,7 +341,7 @@ def refined(mesh: meshes.Mesh, wavelength: float, how: str) -> meshes.Mesh:
     doing("refining the source for the style")
     if how == "auto":
         return meshes.refine(mesh, max(wavelength / PER_WAVE * scale, longest))
-    # An even mesh has all its edges halved at once, or only some, by a hair of the length.
+    # On a uniform mesh, a tiny change of the length decides if all edges are halved or only some.
     low, high = longest / 2, longest * 2
     fine = mesh
     for _ in range(8):
@@ -352,25 +354,26 @@ def refined(mesh: meshes.Mesh, wavelength: float, how: str) -> meshes.Mesh:
 
 
 def too_coarse(mesh: meshes.Mesh, wavelength: float) -> list[str]:
-    """A note where the mesh's edges can't carry details of this size, in radii."""
+    """A note if the mesh's edges are too long for details of this size, in radii."""
     edge = meshes.mean_edge_length(mesh.vertices, mesh.faces)
     edge /= meshes.normalisation(mesh.vertices).scale
     if edge <= wavelength / 4:
         return []
     return [
-        f"'{mesh.name}' is coarse for this style: its edges are {edge:.3f} radii long, the style's "
-        f"details about {wavelength:.3f}; add source.refine=auto, which keeps texture coordinates."
+        f"'{mesh.name}' is too coarse for this style: its edges are {edge:.3f} radii long, and the "
+        f"style's details about {wavelength:.3f}; add source.refine=auto, which keeps texture "
+        "coordinates."
     ]
 
 
 def mistaken(config: Config, style: meshes.Mesh | np.ndarray, heights: Heights | None) -> list[str]:
-    """A note on a normal map whose colours are read as tone, because the method can't do else."""
+    """A note on a normal map whose colours this method can only read as tone."""
     if heights is None or isinstance(style, meshes.Mesh) or config.style.kind != "auto":
         return []
     name = config.style.path or config.style.name
     if heights.in_proportion:
         way = "down (DirectX)" if heights.kind == "normal_dx" else "up (OpenGL)"
-        return [f"'{name}' is read as a normal map, green {way}, as style.kind=auto found"]
+        return [f"'{name}' is read as a normal map, green {way} (detected by style.kind=auto)"]
     if not is_normal_map(style):
         return []
     return [
@@ -380,16 +383,16 @@ def mistaken(config: Config, style: meshes.Mesh | np.ndarray, heights: Heights |
 
 
 def no_relief(config: StyleConfig) -> list[str]:
-    """A note on a style that is a smooth ball."""
+    """A note on a style without relief."""
     return [
-        f"the style '{config.path or config.name}' has no relief to speak of, its surface is "
-        "smooth: the source stays as it is"
+        f"the style '{config.path or config.name}' has no relief, its surface is smooth: the "
+        "source is left unchanged"
     ]
 
 
 def stray_faces(what: str, mesh: meshes.Mesh) -> list[str]:
-    """A note where a few faces lie so far off that the rest is tiny in the unit sphere, and so in
-    all views."""
+    """A note if a few faces lie so far away that the rest is tiny in the unit sphere, and so in all
+    views."""
     distance = np.linalg.norm(mesh.vertices - np.median(mesh.vertices, axis=0), axis=1)
     bulk = float(np.quantile(distance, 0.99))
     far = (distance[mesh.faces] > 3 * bulk).any(axis=1)
@@ -398,8 +401,8 @@ def stray_faces(what: str, mesh: meshes.Mesh) -> list[str]:
     first = int(far.argmax())
     x, y, z = mesh.vertices[mesh.faces[first]].mean(axis=0)
     return [
-        f"{far.sum()} of the {len(far)} faces of the {what} '{mesh.name}' lie far from all others "
-        f"(the first, number {first} from 0, at {x:.4g}, {y:.4g}, {z:.4g}): delete them in a mesh "
+        f"{far.sum()} of the {len(far)} faces of the {what} '{mesh.name}' are far from all others "
+        f"(the first has index {first}, at {x:.4g}, {y:.4g}, {z:.4g}): delete them in a mesh "
         f"editor, or the rest fills only {100 * bulk / distance.max():.0f} % of every view."
     ]
 
@@ -424,7 +427,7 @@ def normalised(mesh: meshes.Mesh, device: torch.device) -> tuple[meshes.Normalis
 
 
 def choose_device(name: str) -> torch.device:
-    """The device asked for; ``auto`` is CUDA where there is one."""
+    """The requested device; ``auto`` is CUDA if available."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
@@ -437,7 +440,7 @@ def choose_device(name: str) -> torch.device:
 
 
 def choose_shading(config: Config, grey: float) -> Shading:
-    """The shading with its background as a number."""
+    """The shading, with its background resolved to a number."""
     named = {"white": 1.0, "black": 0.0, "foreground": grey}
     background = config.shading.background
     return Shading(
@@ -449,7 +452,7 @@ def choose_shading(config: Config, grey: float) -> Shading:
 
 
 def foreground_mean(config: Config, renderer: Renderer, surface: Surface) -> float:
-    """Mean grey of the mesh itself over eight views around it."""
+    """Mean grey of the mesh's pixels over eight views around it."""
     shading = Shading(albedo=config.shading.albedo, normals=config.shading.normals)
     azimuth = torch.arange(8, device=surface.vertices.device) * (math.pi / 4)
     cameras = orbit(torch.zeros_like(azimuth), azimuth, config.views.distance, config.views.fov)

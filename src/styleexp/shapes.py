@@ -1,10 +1,10 @@
-"""Analytic shapes: styles with a known relief, and sources to put it on. Nothing to download.
+"""Analytic shapes, styles with a known relief and sources to apply it to. Nothing to download.
 
-Most styles are the unit sphere displaced along its radius by a relief that is a formula of the
-direction: one can look at them, and also ask ``relief(name, points)`` for the true height anywhere.
-Those are named after the paper's (Sec. 4.2.1) and made from its words. The others show what else a
-style mesh can be: many components, a drum, a high genus, an open surface. Lengths are in units of
-the sphere's radius, +Y is up. Everything is deterministic.
+Most styles are the unit sphere, displaced radially by a closed-form function of the direction, so
+``relief(name, points)`` gives the true height anywhere. They are named after the paper's styles
+(Sec. 4.2.1) and follow its descriptions. The others cover further kinds of style meshes: many
+components, a drum, a high genus, an open surface. Lengths are in sphere radii; +Y is up. Everything
+is deterministic.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ STYLES: dict[str, str] = {
     "bubble": "packed hemispheres of one size that touch each other",
     "buckyball": "raised struts around sunk pentagons and hexagons",
     "scales": "overlapping rounded scales, like a fish's, pointing down",
-    "cracks": "irregular plates parted by narrow grooves, like dried mud",
-    "wool": "curly tufts, each a ball of its own that overlaps the next ones",
-    "knit": "rows of knitted stitches, V below V, round a drum",
-    "weave": "flat bands that pass over and under each other, round a drum",
+    "cracks": "irregular plates separated by narrow grooves, like dried mud",
+    "wool": "curly tufts, each a separate ball that overlaps its neighbours",
+    "knit": "rows of knitted stitches, V below V, around a drum",
+    "weave": "flat bands that pass over and under each other, around a drum",
     "lattice": "round struts along a football's seams, with holes between them",
     "terrain": "hills and valleys on a square tile, an open surface",
 }
@@ -49,10 +49,11 @@ def names() -> list[str]:
 
 
 def make(name: str, detail: int | None = None) -> Mesh:
-    """The shape of that name: manifold, outward, closed but for ``terrain``, of even triangles.
+    """Make the named shape: manifold, oriented outward, closed except ``terrain``, uniform
+    triangles.
 
-    ``detail`` is about how many vertices it gets; by default 40,000 for a style, so that the relief
-    is crisp, and about 16,000 for a source. Raises `UserError` for an unknown name.
+    ``detail`` is the approximate number of vertices: by default 40,000 for a style, so that the
+    relief is crisp, and about 16,000 for a source. Raises `UserError` for an unknown name.
     """
     if name in _MADE:
         points, faces = (array.copy() for array in _MADE[name](detail or 40_000))
@@ -79,7 +80,7 @@ def relief(name: str, points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray
         raise unknown_name("style on a sphere", name, RELIEFS)
     points = np.asarray(points, dtype=np.float64)
     directions = points / np.linalg.norm(points, axis=1, keepdims=True)
-    # In pieces, since most reliefs compare every point with every centre.
+    # In chunks, since most reliefs compare every point with every centre.
     pieces = [RELIEFS[name](directions[at : at + 4096]) for at in range(0, len(points), 4096)]
     return np.concatenate(pieces) if pieces else np.zeros(0)
 
@@ -111,7 +112,7 @@ def _gap(count: int) -> float:
 def _wave(directions: np.ndarray, frequency: int, height: float) -> np.ndarray:
     # Gaussians on a hexagonal lattice, wide enough to overlap: nearly a sum of cosines, and without
     # a preferred direction, which the spirals of a Fibonacci lattice would have.
-    centers = _icosphere(frequency)[0][:, [1, 0, 2]]  # turned, so as not to lie on the rails' nodes
+    centers = _icosphere(frequency)[0][:, [1, 0, 2]]  # rotated, to avoid the rails' nodes
     sharpness = 1.0 / (0.30 * _gap(len(centers))) ** 2
     total = np.exp(sharpness * (directions @ centers.T - 1.0)).sum(axis=1)
     mean = len(centers) / (2.0 * sharpness)  # of the sum over the sphere
@@ -166,7 +167,7 @@ def _rail(directions: np.ndarray) -> np.ndarray:
 def _bubble(directions: np.ndarray) -> np.ndarray:
     centers, depth, radius = _fibonacci(130), 0.92, 0.18
     cosine = (directions @ centers.T).max(axis=1)
-    # Where the ray from the origin leaves the ball of that radius around depth * center.
+    # Where the ray from the origin exits the ball of that radius around depth * center.
     inside = radius**2 - depth**2 * (1.0 - cosine**2)
     outer = depth * cosine + np.sqrt(np.maximum(inside, 0.0))
     return np.maximum(np.where(inside > 0, outer, 0.0), 0.985) - 1.0
@@ -174,9 +175,9 @@ def _bubble(directions: np.ndarray) -> np.ndarray:
 
 @cache
 def _truncated_icosahedron() -> np.ndarray:
-    """Face normals over face distances (32, 3) of the truncated icosahedron."""
+    """Face normals divided by face distances (32, 3) of the truncated icosahedron."""
     points, faces = _icosahedron()
-    hexagons = points[faces].mean(axis=1)  # they lie in the icosahedron's own faces
+    hexagons = points[faces].mean(axis=1)  # these lie in the icosahedron's faces
     a, b = points[faces[0, 0]], points[faces[0, 1]]
     corner = (2.0 * a + b) / 3.0
     pentagons = points * (corner @ a)
@@ -192,9 +193,9 @@ def _buckyball(directions: np.ndarray) -> np.ndarray:
 
 
 def _from_border(directions: np.ndarray, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance of each direction (n, 3) from the border of its cell, and the cell's number.
+    """Distance of each direction (n, 3) from its cell's border, and the cell's index.
 
-    Cell i is where plane i comes first: p_i . d is larger than every other p_j . d.
+    Cell i is the region where p_i . d is larger than every other p_j . d.
     """
     value = directions @ planes.T
     cell = value.argmax(axis=1)
@@ -211,8 +212,8 @@ def _scales(directions: np.ndarray) -> np.ndarray:
     up = np.array([0.0, 1.0, 0.0]) - centers * centers[:, 1:2]
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     cosine = directions @ centers.T
-    near = np.argpartition(-cosine, 8, axis=1)[:, :8]  # no more discs overlap anywhere
-    # Each scale is a disc tilted so that its lower edge lies on top of the next ones.
+    near = np.argpartition(-cosine, 8, axis=1)[:, :8]  # at most 8 discs overlap
+    # Each scale is a disc, tilted so that its lower edge lies on top of the next ones.
     away = np.sqrt(np.maximum(2.0 - 2.0 * np.take_along_axis(cosine, near, axis=1), 0.0)) / radius
     down = -np.einsum("nk,njk->nj", directions, up[near]) / radius
     side = np.maximum(away**2 - down**2, 0.0)
@@ -229,7 +230,7 @@ def _plates() -> np.ndarray:
 
 
 def _cracks(directions: np.ndarray) -> np.ndarray:
-    # Bend the directions a little, so that the cracks are no straight lines.
+    # Perturb the directions, so that the cracks aren't straight.
     bent = directions.copy()
     for k, (wave, phase) in enumerate(((9.0, 0.3), (17.0, 1.1), (29.0, 2.3))):
         bent += 0.12 / wave * np.sin(wave * np.roll(directions, k + 1, axis=1) + phase)
@@ -250,7 +251,7 @@ RELIEFS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "scales": _scales,
     "cracks": _cracks,
 }
-"""Of the styles on the sphere: the height in each direction."""
+"""Height functions of the styles on the sphere, from directions to heights."""
 
 
 # ----------------------------------------------------------------------------------------- meshes
@@ -281,7 +282,7 @@ def _icosphere(frequency: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def icosphere(detail: int) -> tuple[np.ndarray, np.ndarray]:
-    """A unit sphere of about ``detail`` vertices: the icosahedron's faces, divided evenly.
+    """Unit sphere of about ``detail`` vertices: an evenly subdivided icosahedron.
 
     Returns vertices (v, 3) and outward faces (f, 3).
     """
@@ -292,7 +293,7 @@ def icosphere(detail: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _torus(detail: int) -> tuple[np.ndarray, np.ndarray]:
     major, minor = 0.7, 0.3
-    # As many steps around the tube as make the triangles equilateral on its middle line.
+    # Steps around the tube that make triangles equilateral on its centre line.
     around = max(8, round(np.sqrt(detail * minor / major * np.sqrt(3.0) / 2.0)))
     along = max(8, 2 * round(detail / around / 2))
     k, m = (
@@ -306,7 +307,7 @@ def _torus(detail: int) -> tuple[np.ndarray, np.ndarray]:
     def at(step: np.ndarray, turn: np.ndarray) -> np.ndarray:
         return (step % along) * around + turn % around
 
-    # Every second ring is half a step ahead, so that the triangles between two rings interlock.
+    # Offset every second ring by half a step, so that triangles between rings interlock.
     odd = k % 2
     before, after = at(k + 1, m + odd - 1), at(k + 1, m + odd)
     here, next_ = at(k, m), at(k, m + 1)
@@ -315,7 +316,7 @@ def _torus(detail: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _ball(points: np.ndarray, center: tuple[float, ...], radii: tuple[float, ...]) -> np.ndarray:
-    """About the signed distance to an ellipsoid, negative inside."""
+    """Approximate signed distance to an ellipsoid, negative inside."""
     at, size = points - np.array(center), np.array(radii)
     one = np.linalg.norm(at / size, axis=1)
     slope = np.linalg.norm(at / size**2, axis=1)
@@ -325,20 +326,20 @@ def _ball(points: np.ndarray, center: tuple[float, ...], radii: tuple[float, ...
 def _limb(
     points: np.ndarray, a: tuple[float, ...], b: tuple[float, ...], ra: float, rb: float
 ) -> np.ndarray:
-    """Signed distance to a capsule whose radius goes from ``ra`` to ``rb``."""
+    """Signed distance to a capsule whose radius varies from ``ra`` to ``rb``."""
     start, axis = np.array(a), np.array(b) - np.array(a)
     along = np.clip((points - start) @ axis / (axis @ axis), 0.0, 1.0)
     return np.linalg.norm(points - start - along[:, None] * axis, axis=1) - (ra + (rb - ra) * along)
 
 
 def _blend(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
-    """Smooth union: the smaller distance, rounded where they are within ``width``."""
+    """Smooth union: the minimum distance, rounded where both are within ``width``."""
     mix = np.maximum(width - np.abs(a - b), 0.0) / width
     return np.minimum(a, b) - mix**3 * width / 6.0
 
 
 def _critter_distance(points: np.ndarray) -> np.ndarray:
-    """An implicit four-legged animal: about the signed distance, negative inside."""
+    """Approximate signed distance to a four-legged animal, negative inside."""
     mirrored = np.abs(points * np.array([1.0, 0.0, 0.0])) + points * np.array([0.0, 1.0, 1.0])
     body = _ball(points, (0.0, 0.0, -0.02), (0.36, 0.35, 0.50))
     body = _blend(body, _ball(points, (0.0, 0.04, 0.26), (0.33, 0.34, 0.28)), 0.15)
@@ -369,9 +370,9 @@ def _surface_net(
     high: tuple[float, ...],
     step: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Zero surface of a signed distance as a closed mesh: a vertex in each cell that it crosses.
+    """Zero surface of a signed distance as a closed mesh, with one vertex per crossed cell.
 
-    gpytoolbox's marching cubes leaves seams open, so this is the dual method instead.
+    Uses the dual method, because gpytoolbox's marching cubes leaves seams open.
     """
     axes = [np.arange(low[k], high[k], step) for k in range(3)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
@@ -415,7 +416,7 @@ def _implicit(
     step: float,
     detail: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Zero surface of a signed distance: a coarse one, evened out, then pulled onto the exact."""
+    """Zero surface of a signed distance: extracted coarsely, remeshed, then projected."""
     import gpytoolbox
 
     points, faces = _surface_net(distance, low, high, step)
@@ -436,7 +437,7 @@ def _implicit(
 
 
 def _wool(detail: int) -> tuple[np.ndarray, np.ndarray]:
-    """Balls round a ball, each with a spiral ridge that starts at its outermost point."""
+    """Balls around a ball, each with a spiral ridge that starts at its outermost point."""
     rng = np.random.default_rng(3)
     count = 80
     centers = _fibonacci(count) + 0.2 * _gap(count) * rng.normal(size=(count, 3))
@@ -458,8 +459,8 @@ def _wool(detail: int) -> tuple[np.ndarray, np.ndarray]:
 def _drum(
     detail: int, height: Callable[[np.ndarray, np.ndarray], np.ndarray], around: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A round drum with ``height(across, up)`` on its wall, where ``around`` units go once round,
-    and on its ends; a rim between them is smooth."""
+    """A round drum with ``height(across, up)`` on its ends and on its wall, whose circumference is
+    ``around`` units; the rim between them is smooth."""
     power, radius = 8.0, 0.8
     points, faces = icosphere(detail)
     side = np.hypot(points[:, 0], points[:, 2])
@@ -479,12 +480,12 @@ def _drum(
 
 
 def _stitches(across: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Knitted stitches a unit wide, 0.75 high: two strands, leaning outward, in each."""
+    """Knitted stitches, 1 wide and 0.75 high, of two strands that lean outward."""
     across = np.abs(across - np.round(across))
     course = 0.75
     total = np.zeros(len(across))
     for row in (-1, 0, 1, 2):
-        # The strand goes from the stitch's foot up and out, a lens that dives under the next one.
+        # The strand runs from the stitch's foot up and out, and dives under the next one.
         x, y = across - 0.25, up - course * (np.floor(up / course) + row)
         lean = np.array([0.28, 0.96])
         along = (x * lean[0] + y * lean[1]) / 0.72
@@ -494,7 +495,7 @@ def _stitches(across: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 
 def _bands(across: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Bands 0.86 wide, a unit apart, over and under each other."""
+    """Bands 0.86 wide, 1 apart, over and under each other."""
     total = np.zeros(len(across))
     for aside, along in ((across, up), (up, across)):
         band = np.floor(aside)
@@ -530,7 +531,7 @@ def _lattice(detail: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _terrain(detail: int) -> tuple[np.ndarray, np.ndarray]:
-    """A tile of 2 by 2 with octaves of billowy noise, the longest the highest."""
+    """A 2 by 2 tile with octaves of billowy noise; the longest wavelength is the highest."""
     side = round(np.sqrt(detail))
     rng = np.random.default_rng(5)
     across = np.linspace(-1.0, 1.0, side)

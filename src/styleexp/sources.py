@@ -1,4 +1,4 @@
-"""From the configured name or path to a mesh or picture."""
+"""Load the mesh or image for a configured name or path."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ IMAGE_SUFFIXES = (
     *(".bmp", ".gif", ".ppm", ".pgm", ".jp2", ".avif"),
 )
 SUFFIXES = (*assets.SUFFIXES["mesh"], *IMAGE_SUFFIXES)
-"""Of the files that can be read."""
+"""Suffixes of readable files."""
 EXPORTS = {
     **dict.fromkeys((".fbx", ".blend", ".max", ".ma", ".mb", ".c4d", ".dae", ".abc"), "GLB"),
     **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz", ".vrm", ".x3d", ".wrl"), "GLB"),
@@ -31,14 +31,14 @@ EXPORTS = {
     **dict.fromkeys((".xyz", ".las", ".laz", ".e57", ".pcd", ".vtk", ".vtp", ".ztl"), "PLY"),
     **dict.fromkeys((".exr", ".hdr", ".psd", ".svg", ".heic", ".raw", ".dng"), "PNG"),
 }
-"""What to export from the program that wrote such a file."""
+"""Formats to export instead, for files of common 3D programs."""
 
 _GIVEN: ContextVar[Mapping[str, Any]] = ContextVar("given", default=MappingProxyType({}))
 
 
 @contextmanager
 def given(**parts: meshes.Mesh | np.ndarray) -> Iterator[None]:
-    """Take the ``source`` or ``style`` from memory, whatever the configuration says."""
+    """Use a ``source`` or ``style`` from memory, overriding the configuration."""
     token = _GIVEN.set(parts)
     try:
         yield
@@ -47,10 +47,9 @@ def given(**parts: meshes.Mesh | np.ndarray) -> Iterator[None]:
 
 
 def check(config: Config) -> None:
-    """Raise `UserError` where a source's, style's or mask's file isn't there or is of no readable
-    kind.
+    """Raise `UserError` if a source, style or mask file is missing or has an unsupported type.
 
-    Reads nothing, loads nothing heavy: a mistyped name is told at once.
+    Reads no files and imports nothing heavy, so that a mistyped name is reported at once.
     """
     for kind, part in identity.parts(config).items():
         path = locate(kind, part.name, part.path)
@@ -65,13 +64,13 @@ def check(config: Config) -> None:
 def _check_suffix(kind: str, path: Path) -> None:
     if export := EXPORTS.get(path.suffix.lower()):
         raise UserError(
-            f"the {kind} '{path}' ends in '{path.suffix}', which is not read: export it as "
+            f"the {kind} '{path}' ends in '{path.suffix}', which is not supported: export it as "
             f"{export} from the program that made it."
         )
 
 
 def load_source(config: SourceConfig) -> meshes.Mesh:
-    """The source mesh, remeshed if so configured."""
+    """Load the source mesh, remeshed if configured."""
     mesh = _load("source", config.name, config.path, config.weld)
     if not isinstance(mesh, meshes.Mesh):
         raise UserError(f"the source '{config.path or config.name}' is an image: give a mesh.")
@@ -82,14 +81,14 @@ def load_source(config: SourceConfig) -> meshes.Mesh:
 
 
 def load_style(config: StyleConfig) -> meshes.Mesh | np.ndarray:
-    """The style: a mesh, or an image of shape (height, width, 3) in [0, 1]."""
+    """Load the style: a mesh, or an image of shape (height, width, 3) in [0, 1]."""
     if "style" not in _GIVEN.get() and config.path is None and plugins.known("style", config.name):
         return _checked(plugins.build("style", config), config.name)
     return _load("style", config.name, config.path)
 
 
 def _checked(style: meshes.Mesh | np.ndarray, name: str | None) -> meshes.Mesh | np.ndarray:
-    """What a style's factory returned, if it can be used."""
+    """Validate the return value of a style's factory."""
     import numpy as np
 
     if isinstance(style, meshes.Mesh):
@@ -103,7 +102,7 @@ def _checked(style: meshes.Mesh | np.ndarray, name: str | None) -> meshes.Mesh |
 
 
 def locate(kind: str, name: str | None, path: str | None) -> Path | None:
-    """The file behind a source or style; None for an analytic shape or a plugin's style."""
+    """File of a source or style; None for an analytic shape or a plugin's style."""
     if path is not None:
         return Path(path)
     if name is None:

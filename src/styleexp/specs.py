@@ -1,6 +1,6 @@
 """The built-in styles, fields and losses, by name. Imports none of them.
 
-Renderers and encoders have a ``specs`` of their own, in their folders.
+Renderers and encoders have their own ``specs`` modules.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ FIELDS = {
         "fourier_mlp", "an MLP on random Fourier features (Sec. 3.2)", FieldConfig, _fourier_mlp
     ),
     "vertex": Spec(
-        "vertex", "a free number for each vertex: no network (baseline)", FieldConfig, _vertex
+        "vertex", "a free displacement per vertex, no network (baseline)", FieldConfig, _vertex
     ),
 }
 LOSSES = {

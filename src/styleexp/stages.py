@@ -1,7 +1,7 @@
-"""What a run is doing, for who waits before a terminal.
+"""Progress messages: what a run is doing.
 
-The parts say what they begin (`doing`), which costs nothing. The command line has it printed where
-it takes long (`announced`).
+Parts announce what they begin (`doing`), which costs nothing. The command line prints the stages
+that take long (`announced`).
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from contextlib import contextmanager, suppress
 FIRST = 1.5
 """Seconds after which a stage is named."""
 AGAIN = 10.0
-"""Seconds after which it is named again, with the time that it has taken."""
+"""Seconds after which it is named again, with its elapsed time."""
 
 _stage: tuple[str, float] = ("", 0.0)
 _listening = 0
 
 
 def doing(what: str, at_once: bool = False) -> None:
-    """Say what begins now, as in "reading the source"; nothing where ``what`` is empty.
+    """Announce a stage, such as "reading the source"; an empty ``what`` ends it.
 
-    ``at_once``: for what Python's other threads can't run beside.
+    ``at_once``: print immediately, for calls that block Python's other threads.
     """
     global _stage
     _stage = (what, time.monotonic())
@@ -32,14 +32,14 @@ def doing(what: str, at_once: bool = False) -> None:
 
 
 def tell(what: str) -> None:
-    """Say what was found, where somebody listens: a Python caller's terminal is its own."""
+    """Print a finding on the command line; silent for Python callers."""
     if _listening:
         print(what, flush=True)
 
 
 @contextmanager
 def announced() -> Iterator[None]:
-    """Have the stages of this process printed that take long."""
+    """Print the stages of this process that take long."""
     global _listening
     ended = threading.Event()
     teller = threading.Thread(target=_tell, args=(ended,), daemon=True)
@@ -61,6 +61,6 @@ def _tell(ended: threading.Event) -> None:
             last, due = stage, FIRST
         seconds = time.monotonic() - begun
         if what and seconds >= due:
-            with suppress(OSError):  # a reader that has gone is the run's own affair
+            with suppress(OSError):  # the run itself handles a closed output
                 print(f"{what} ..." if due == FIRST else f"{what}: {seconds:.0f} s", flush=True)
             due = seconds + AGAIN

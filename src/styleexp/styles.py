@@ -1,4 +1,4 @@
-"""Style sources: a mesh or an image, turned into the Gram matrices to reach (Sec. 4.2)."""
+"""Style sources: a mesh or an image, converted to target Gram matrices (Sec. 4.2)."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from styleexp.viewer import Viewer
 
 BANK_STEP = 1_000_000
-"""Steps from here on number the style bank's draws, so that no training step draws the same."""
+"""First step number of the style bank's draws, so that no training step draws the same."""
 OWN_VIEWS = 2_000_000
-"""The same for the style's views with ``loss.target=own_views``."""
+"""First step number of the style's views with ``loss.target=own_views``."""
 
 
 class StyleTarget(Protocol):
-    """The Grams that the generated mesh should have in a step: of global and of local views."""
+    """Target Grams of a step, for global and local views."""
 
     def __call__(self, step: int) -> tuple[Grams, Grams]:
         """The Grams for this step."""
@@ -36,19 +36,19 @@ class StyleTarget(Protocol):
 
 
 class FixedTarget:
-    """The same Grams in every step: averages over a bank of views of the style."""
+    """Constant Grams, averaged over a bank of views of the style."""
 
     def __init__(self, whole: Grams, local: Grams):
         self.grams = whole, local
 
     def __call__(self, step: int) -> tuple[Grams, Grams]:
-        """The same for every step."""
+        """The constant Grams, for any step."""
         return self.grams
 
 
 class RenderedTarget:
-    """The style mesh rendered anew in every step: at the generated mesh's own views, as in the
-    paper, or ``later`` steps' ones, so that the two see different views."""
+    """Grams of the style mesh, rendered in every step: at the generated mesh's views, as in the
+    paper, or at those of ``later`` steps, so that the two see different views."""
 
     def __init__(
         self, loss: StyleLoss, viewer: Viewer, vertices: Float[Tensor, "vertices 3"], later: int = 0
@@ -63,7 +63,7 @@ class RenderedTarget:
 
 
 def mean_grams(loss: StyleLoss, batches: Iterator[tuple[Images, Images]]) -> tuple[Grams, Grams]:
-    """Grams of global and of local views, averaged over batches."""
+    """Grams of global and local views, averaged over batches."""
     with torch.no_grad():
         pairs = [(loss.grams(whole), loss.grams(local)) for whole, local in batches]
     return _mean([g for g, _ in pairs]), _mean([g for _, g in pairs])
@@ -80,11 +80,11 @@ def mesh_grams(
 def image_bank(
     picture: Float[Tensor, "height width"], config: Config, unit: float
 ) -> Iterator[tuple[Images, Images]]:
-    """Windows of a style picture with the texel density that the views of the result have.
+    """Windows of a style image, at the texel density of the result's views.
 
-    A square picture has the area of a sphere of radius ``image_tile * unit``, in radii of the
-    source; it is mirrored at its borders where a view is wider. Each batch holds ``count`` global
-    and ``count * per_view`` local windows at random places.
+    A square image has the area of a sphere of radius ``image_tile * unit``, in radii of the source;
+    it is mirrored where a view is wider. Each batch holds ``count`` global and ``count * per_view``
+    local windows at random positions.
     """
     views_, local = config.views, config.views.local
     span = config.style.image_tile * unit * math.sqrt(4 * math.pi)
@@ -106,8 +106,8 @@ def image_bank(
 def whole_image_bank(
     picture: Float[Tensor, "height width"], config: Config
 ) -> Iterator[tuple[Images, Images]]:
-    """The paper's reading: the picture itself is the global view, local views are its crops; with
-    ``loss.target=whole`` the picture itself, too."""
+    """As in the paper: the image is the global view, and local views are its crops; with
+    ``loss.target=whole`` local views are also the whole image."""
     count, local = config.views.count, config.views.local
     size = [config.views.resolution, config.views.resolution]
     whole = functional.interpolate(picture[None, None], size, mode="bilinear", antialias=True)
@@ -133,7 +133,7 @@ def _all_seen(image: Float[Tensor, "n height width channels"]) -> Images:
 def tone(
     rgb: Float[Tensor, "height width 3"], mean: float, style: StyleConfig
 ) -> Float[Tensor, "height width"]:
-    """The picture in grey, with the tone of a render: its contrast sets the relief's height."""
+    """The image in grey, with the tone of a render; its contrast sets the relief's height."""
     picture = rgb @ rgb.new_tensor([0.299, 0.587, 0.114])  # luma, ITU-R BT.601
     centre = picture.mean()
     contrast = 1.0
@@ -146,20 +146,20 @@ def tone(
 def resized(
     picture: Float[Tensor, "height width"], longer_side: float
 ) -> Float[Tensor, "rows columns"]:
-    """The picture with about ``longer_side`` pixels on its longer side, free of aliasing."""
+    """Resize an image to about ``longer_side`` pixels on its longer side, with antialiasing."""
     factor = longer_side / max(picture.shape)
     shape = [max(8, round(side * factor)) for side in picture.shape]
     return functional.interpolate(picture[None, None], shape, mode="bilinear", antialias=True)[0, 0]
 
 
 def global_texels(config: ViewsConfig) -> float:
-    """Pixels of a global view that a length of one source radius at the object's centre takes."""
+    """Pixels per source radius at the object's centre, in global views."""
     half = config.distance * torch.tensor(config.fov / 2).deg2rad().tan().item()
     return config.resolution / (2 * half)
 
 
 def local_texels(config: ViewsConfig) -> float:
-    """The same for local views."""
+    """Pixels per source radius, in local views."""
     local = config.local
     if local.mode == "surface":
         return local.size / local.extent
@@ -174,8 +174,8 @@ def picture_windows(
     count: int,
     generator: torch.Generator,
 ) -> Images:
-    """``count`` square windows of ``size`` pixels at random places of a picture that is brought to
-    ``longer_side`` pixels; it is mirrored at its borders."""
+    """``count`` square windows of ``size`` pixels at random positions in an image resized to
+    ``longer_side`` pixels and mirrored at its borders."""
     shown = resized(picture, longer_side)
     height, width = shown.shape
     cut = []

@@ -1,4 +1,4 @@
-"""The paper on one page: a displacement field, learned until the renders' Grams match the style's.
+"""The paper's method: optimise a displacement field until the renders' Grams match the style's.
 
 source mesh C ──► Fourier features ──► MLP ──► d ──► M = C + d n          Sec. 3.2, Eq. 1
 M ──► differentiable renderer ──► global and local views                  Sec. 3.3.1, Eq. 2
@@ -43,11 +43,11 @@ if TYPE_CHECKING:
 
 
 EXPLODED = 1e6
-"""A loss so many times the first one's is no loss any more."""
+"""The run counts as diverged above this multiple of the first loss."""
 
 
 class Diverged(UserError):
-    """The numbers of a step can't be gone on with."""
+    """A step produced values the run cannot continue from."""
 
     def __init__(self, step: int, part: str, told: str):
         self.step, self.part = step, part
@@ -58,13 +58,13 @@ class Diverged(UserError):
 
 
 WARM_UP = 0.1
-"""Share of the run over which the cosine schedule's rate rises from 0: Adam's first steps are as
-long as any, and their direction is mostly noise."""
+"""Fraction of the run over which the cosine schedule warms up. Adam's first steps are as long as
+any other, but their direction is mostly noise."""
 
 
 @dataclass
 class State:
-    """All that a step changes: what a checkpoint holds."""
+    """Everything a step changes; the content of a checkpoint."""
 
     field: Any
     """A module such as `fields.DisplacementField`."""
@@ -74,16 +74,16 @@ class State:
 
 @dataclass(frozen=True)
 class Step:
-    """What one step of the optimisation measured."""
+    """Measurements of one optimisation step."""
 
     step: int
     loss: float
     loss_global: float
     loss_local: float
     rms_displacement: float
-    """In radii of the normalised source."""
+    """RMS displacement, in radii of the normalised source."""
     blank_views: int
-    """Views that don't show the mesh: a masked loss (``loss.masked``) skips them."""
+    """Number of views that don't show the mesh; a masked loss (``loss.masked``) skips them."""
     seconds: float = field(compare=False)
 
 
@@ -92,11 +92,11 @@ class Result:
     """The generated mesh M."""
 
     scene: Subject
-    """Its source has the result's faces."""
+    """The run's subject; its source has the result's faces."""
     displacement: Float[np.ndarray, " vertices"]
-    """Signed, along the source's normals, in the source's own units."""
+    """Signed displacement along the source's normals, in the source's own units."""
     vertices: Float[np.ndarray, "vertices 3"]
-    """In the source's own frame."""
+    """Positions in the source's own frame."""
 
     @property
     def faces(self) -> Int[np.ndarray, "faces 3"]:
@@ -104,8 +104,8 @@ class Result:
         return self.scene.source.faces
 
     def trimesh(self) -> Any:
-        """M as a ``trimesh.Trimesh`` with these vertices and faces, in this order; the displacement
-        is its vertex attribute ``displacement``."""
+        """M as a ``trimesh.Trimesh`` with the same vertex and face order; the displacement is the
+        vertex attribute ``displacement``."""
         import trimesh
 
         return trimesh.Trimesh(
@@ -124,26 +124,26 @@ def stylize(source: MeshLike, style: MeshLike | np.ndarray, *overrides: str) -> 
     """Put the local geometry of ``style``, a mesh or picture, onto the mesh ``source``.
 
     Args:
-        source: a name, a file (what has a suffix or a folder, or exists), a `Mesh`, a
+        source: a name, a file (a string with a suffix or folder, or an existing path), a `Mesh`, a
             ``trimesh.Trimesh``, or ``(vertices, faces)`` of shapes (vertices, 3) and (faces, 3).
-        style: the same, or a picture of shape (height, width) or (height, width, channels), row 0
-            at the top: integers of 8 or 16 bits, or floats in [0, 1].
-        overrides: those of the command line: ``stylize("my.obj", "bubble", "strength=0.5",
+        style: as for ``source``, or an image array of shape (height, width) or (height, width,
+            channels), row 0 at the top: 8- or 16-bit integers, or floats in [0, 1].
+        overrides: as on the command line: ``stylize("my.obj", "bubble", "strength=0.5",
             "style.scale=2")``.
 
     Returns:
-        The generated mesh. Nothing is written; ``save`` writes it.
+        The generated mesh. Nothing is written to disk; use ``save``.
 
     Raises:
-        UserError: for what the command line would report.
+        UserError: for any error that the command line would report.
 
     Warns:
-        UserWarning: of repairs, of vertices left out or joined (the result's vertices are then not
-            the given ones; its faces are), of a mesh too coarse, of overrides that the method
-            doesn't read: what the command line notes.
+        UserWarning: for everything that the command line prints as a note: repairs, vertices
+            removed or merged (the result then has other vertices than the input, but the same
+            faces), a mesh that is too coarse, overrides that the method ignores.
 
-    The process is left as it was: torch's number of threads (``threads=`` holds for this call) and
-    its random numbers, and everything of a Hydra application that calls this.
+    Process state is restored: torch's number of threads (``threads=`` applies to this call only),
+    its random state, and the state of a calling Hydra application.
     """
     config, given = configured(source, style, overrides)
     with sources.given(**given), process.undisturbed(config):
@@ -162,7 +162,7 @@ def stylize(source: MeshLike, style: MeshLike | np.ndarray, *overrides: str) -> 
 def configured(
     source: MeshLike, style: MeshLike | np.ndarray, overrides: Sequence[str]
 ) -> tuple[Config, dict[str, Any]]:
-    """The configuration of a run, and what of source and style is in memory, by its key."""
+    """The configuration of a run, and the in-memory source and style, by key."""
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
@@ -190,13 +190,13 @@ def configured(
 
 
 def configure(source: str | Path, style: str | Path, overrides: Sequence[str]) -> Config:
-    """The configuration of a run, from names or files and the command line's overrides."""
+    """Build the configuration of a run, from names or files and command-line overrides."""
     return configured(source, style, overrides)[0]
 
 
 def start(scene: Scene) -> State:
-    """The state before the first step: M is the source C, or with ``field.start=map`` C under the
-    style's height map, to which the field is added."""
+    """State before the first step: M is the source C, or with ``field.start=map`` C displaced by
+    the style's height map, which the field adds to."""
     optim = scene.config.optim
     generator = step_generator(optim.seed, 0, stream=7)
     config, bound = scene.config.field, scene.bound
@@ -206,7 +206,7 @@ def start(scene: Scene) -> State:
         "field", config, generator=generator, sigma=scene.sigma, bound=bound
     )
     displacement_field.to(scene.surface.vertices.device)
-    displacement_field.encode(scene.surface.vertices)  # lazy parameters get their shape here
+    displacement_field.encode(scene.surface.vertices)  # initialises lazy parameters
     adam = torch.optim.Adam(displacement_field.parameters(), lr=optim.rate)
     return State(displacement_field, adam)
 
@@ -266,23 +266,23 @@ def optimise(scene: Scene, state: State) -> Iterator[Step]:
 
 
 def gradient_length(field: torch.nn.Module) -> Float[Tensor, ""]:
-    """Length of the gradient of all parameters together."""
+    """Norm of the gradient over all parameters."""
     return torch.nn.utils.get_total_norm([p.grad for p in field.parameters() if p.grad is not None])
 
 
 def normalise_gradient(field: torch.nn.Module, length: Float[Tensor, ""]) -> None:
-    """Scale the gradient of all parameters together, of this length, to 1; zero stays zero."""
+    """Divide the gradient of all parameters by ``length``, its norm; zero stays zero."""
     for parameter in field.parameters():
         if parameter.grad is not None:
             parameter.grad /= length.clamp(min=1e-30)
 
 
 def _check_numbers(step: int, parts: dict[str, Tensor], total: float, first: float) -> None:
-    """Raise `Diverged` at the first part that isn't finite, or where the loss ``total`` is
-    `EXPLODED` times what it was ``first``. All parts count: a fused ReLU turns NaN into 0, so a
-    picture's may not reach the loss. The field is as it was before the step."""
-    # The least and the most are NaN if any is: four times as fast as asking each number. All parts
-    # are asked at once, since each answer makes a GPU wait.
+    """Raise `Diverged` for the first part that isn't finite, or if the loss ``total`` exceeds
+    `EXPLODED` times the ``first`` one. All parts are checked, because a fused ReLU turns NaN into
+    0, so NaN in a picture may not reach the loss. The field is still unchanged by the step."""
+    # Minimum and maximum are NaN if any value is: four times as fast as checking each value. All
+    # parts are checked together, since each transfer synchronises the GPU.
     ranges = [torch.stack(values.detach().aminmax()) for values in parts.values()]
     finite = torch.stack([each.isfinite().all() for each in ranges]).tolist()
     for part, is_finite in zip(parts, finite, strict=True):
@@ -293,12 +293,12 @@ def _check_numbers(step: int, parts: dict[str, Tensor], total: float, first: flo
 
 
 def blank(seen: Images) -> int:
-    """How many of the views don't show the mesh at all."""
+    """Number of views that don't show the mesh at all."""
     return int((seen.coverage.flatten(1).amax(1) <= 0).sum())
 
 
 def learning_rate(optim: OptimConfig, step: int) -> float:
-    """The rate of a step: see ``OptimConfig.schedule``."""
+    """Learning rate of a step; see ``OptimConfig.schedule``."""
     if optim.schedule == "step":
         shorter = (optim.nominal_steps or optim.steps) / optim.steps
         decays = math.floor(step * shorter / optim.decay_every)
@@ -311,8 +311,8 @@ def learning_rate(optim: OptimConfig, step: int) -> float:
 def displace(
     scene: Scene, state: State, precision: torch.dtype | None = None
 ) -> Float[Tensor, " vertices"]:
-    """The displacement d of every vertex, in radii of the normalised source: the field's, on top of
-    ``scene.base`` where there is one (``field.start``; the paper has none), within ``scene.mask``.
+    """Displacement d of every vertex, in radii of the normalised source: the field's output plus
+    ``scene.base``, if any (``field.start``; the paper has none), times ``scene.mask``.
     """
     config = scene.config.field
     if precision is None:
@@ -329,7 +329,7 @@ def displace(
 
 
 def finish(scene: Scene, state: State) -> Result:
-    """The generated mesh in the source's own frame; the field is evaluated in float32."""
+    """Return the generated mesh in the source's own frame; the field is evaluated in float32."""
     with torch.no_grad():
         displacement = displace(scene, state, torch.float32).double() * scene.config.strength
         if scene.config.field.unfold:
@@ -344,8 +344,8 @@ def finish(scene: Scene, state: State) -> Result:
 
 
 class _CallableModule(types.ModuleType):
-    """Lets ``styleexp.stylize(...)`` work although importing this module puts the module itself
-    there."""
+    """Makes the module callable: importing it replaces ``styleexp.stylize`` by the module
+    itself."""
 
     def __call__(self, source: MeshLike, style: MeshLike | np.ndarray, *overrides: str) -> Result:
         return stylize(source, style, *overrides)

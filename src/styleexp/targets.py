@@ -1,9 +1,8 @@
-"""What a configuration may have Hydra call: nothing but parts of Hydra and its search, and of this
-package.
+"""Allow-list of Hydra targets: Hydra's own parts, its search plugin, and this package.
 
 Hydra builds callbacks, launchers and sweepers from ``_target_``, and logging from ``()`` and
-``class``, each of which may name any function that can be imported. Configuration files get passed
-around, so what they name is looked at before any of it is built.
+``class``, each of which may name any importable function. Configuration files get shared, so all
+names are checked before anything is built.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ LOGGING = ("logging.StreamHandler", "logging.FileHandler", "logging.NullHandler"
 
 
 def guard() -> None:
-    """Have every configuration that Hydra composes in this process checked (`load`). Safe to call
-    again. For processes of ours alone: it changes Hydra."""
+    """Check every configuration that Hydra composes in this process (see `load`). Safe to call
+    again. It patches Hydra, so only call it in our own processes."""
     from hydra._internal.config_loader_impl import ConfigLoaderImpl
 
     real = ConfigLoaderImpl.load_configuration
@@ -35,8 +34,8 @@ def guard() -> None:
 
 
 def load(compose: Callable[[], Any]) -> Any:
-    """What ``compose`` returns, checked. What Hydra raises for odd overrides besides its own errors
-    becomes a `UserError`."""
+    """Call ``compose`` and check the result. Other exceptions than Hydra's own, raised for odd
+    overrides, become `UserError`."""
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
@@ -52,7 +51,7 @@ def load(compose: Callable[[], Any]) -> Any:
 
 
 def check(config: Any) -> None:
-    """Raise `UserError` for a function or class that a configuration must not name."""
+    """Raise `UserError` if a configuration names a function or class that isn't allowed."""
     from omegaconf import OmegaConf
 
     for key, value in _named(OmegaConf.to_container(config, resolve=False)):
@@ -60,13 +59,14 @@ def check(config: Any) -> None:
         allowed = ALLOWED if last == "_target_" else LOGGING if last == "class" else ()
         if not isinstance(value, str) or not value.startswith(allowed):
             raise UserError(
-                f"the configuration has {key}={value}, which would run code that is not this "
-                "package's: remove it; parts of your own are plugins (docs/write-a-backend.md)."
+                f"the configuration has {key}={value}, which would run code from outside this "
+                "package: remove it; to add your own parts, write a plugin "
+                "(docs/write-a-backend.md)."
             )
 
 
 def _named(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """Keys and values of what would be called."""
+    """Yield keys and values of everything that Hydra would call."""
     for name, value in node.items() if isinstance(node, dict) else ():
         full = f"{key}.{name}" if key else str(name)
         in_logging = "logging" in key.split(".", 2)[:2][-1]

@@ -1,8 +1,8 @@
-"""Conformance checks for rendering backends, ours and yours.
+"""Conformance checks for rendering backends, built in or custom.
 
-Every check takes a ``Renderer``, says in its docstring what must hold, and raises
-``AssertionError`` where it does not. It raises ``NotApplicable`` where the backend does not claim,
-in its ``capabilities`` or by what it returns, what the check is about. In a test-suite::
+Every check takes a ``Renderer``, states in its docstring what must hold, and raises
+``AssertionError`` if it doesn't. It raises ``NotApplicable`` if the backend doesn't claim the
+property, in its ``capabilities`` or by its outputs. In a test suite::
 
     @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
     def test_conformance(check):
@@ -11,8 +11,8 @@ in its ``capabilities`` or by what it returns, what the check is about. In a tes
         except NotApplicable as reason:
             pytest.skip(str(reason))
 
-or, all at once, ``check_renderer(MyRenderer())``. The checks run on the first device that the
-backend names, in float32, and take about ten seconds on one CPU core for ``SoftRaster``.
+or, all at once, ``check_renderer(MyRenderer())``. The checks run in float32 on the backend's first
+device, and take about ten seconds on one CPU core for ``SoftRaster``.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 EVEN = Shading(albedo=0.25, ambient=1.0, light=(0.0, 0.0, 0.0))
-"""Every surface has intensity 0.25: what is left of a picture is its outline."""
+"""Shading with intensity 0.25 everywhere, so that only outlines show."""
 
 
 class NotApplicable(Exception):
-    """The backend does not claim what the check is about."""
+    """The backend doesn't claim the checked property."""
 
 
 Check = Callable[[Renderer], None]
 
 
 def check_renderer(renderer: Renderer) -> dict[str, str]:
-    """Run every check; returns its outcome, ``passed`` or ``not applicable: ...``, by name.
+    """Run every check; return the outcomes, ``passed`` or ``not applicable: ...``, by name.
 
-    Raises ``AssertionError`` that lists the checks that failed, after all have run.
+    After all have run, raises ``AssertionError`` that lists the failed checks.
     """
     outcomes, failures = {}, []
     for check in CHECKS:
@@ -71,7 +71,7 @@ def watertight(renderer: Renderer) -> None:
 
 
 def watertight_on_pixel_centres(renderer: Renderer) -> None:
-    """The same with all vertices snapped to pixel centres and corners."""
+    """`watertight`, with all vertices snapped to pixel centres and corners."""
     _need_ties(renderer)
     for seed in range(3):
         vertices, faces = _grid(5, seed)
@@ -80,7 +80,7 @@ def watertight_on_pixel_centres(renderer: Renderer) -> None:
 
 
 def rectangle_through_pixel_centres(renderer: Renderer) -> None:
-    """Edges through pixel centres own exactly half of them; wound the other way, it is culled."""
+    """Edges through pixel centres own exactly half of them; with reversed winding it is culled."""
     _need_ties(renderer)
     low_x, high_x, low_y, high_y = 4.5, 21.5, 6.5, 15.5
     corners = [(low_x, low_y), (low_x, high_y), (high_x, high_y), (high_x, low_y)]
@@ -99,7 +99,7 @@ def rectangle_through_pixel_centres(renderer: Renderer) -> None:
 
 
 def nearer_face_wins(renderer: Renderer) -> None:
-    """Of two overlapping faces the nearer is seen, whichever comes first."""
+    """The nearer of two overlapping faces is visible, regardless of their order."""
     near, far = _triangle(z=0.5), _triangle(z=-0.5)
     for first, second, winner in ((near, far, 0), (far, near, 1)):
         vertices = torch.cat([first, second])
@@ -110,7 +110,7 @@ def nearer_face_wins(renderer: Renderer) -> None:
 
 
 def equal_depth_goes_to_lowest_index(renderer: Renderer) -> None:
-    """Faces in the very same place: the first is seen."""
+    """Of coincident faces, the first is visible."""
     _need_ties(renderer)
     faces = torch.tensor([[0, 1, 2]]).repeat(5, 1)
     ids = _ids(_render(renderer, _triangle(), faces, _front_camera()))
@@ -119,7 +119,7 @@ def equal_depth_goes_to_lowest_index(renderer: Renderer) -> None:
 
 
 def orientation(renderer: Renderer) -> None:
-    """An asymmetric picture lands the right way up and round: rows down, columns right."""
+    """An asymmetric image is neither flipped nor mirrored: rows go down, columns right."""
     # A right angle at the top left, and one pixel at the bottom right.
     big = [(1, 1), (1, 5), (7, 1)]
     dot = [(6, 6), (6, 8), (8, 6)]
@@ -139,7 +139,7 @@ def orientation(renderer: Renderer) -> None:
         "......1.",
         "........",
     ]
-    # The hypotenuses pass through no pixel centre but the dot's own, two of which they may own.
+    # The hypotenuses pass through no pixel centres but the dot's own, and may own two of them.
     found = ["".join("." if i < 0 else str(i) for i in row) for row in ids[0].tolist()]
     found[6] = found[6].replace("11", "1.")
     found[7] = found[7].replace("1", ".")
@@ -162,7 +162,7 @@ def crop_is_part_of_whole(renderer: Renderer) -> None:
 
 
 def hidden_outlines_do_not_show(renderer: Renderer) -> None:
-    """What lies wholly behind a surface changes neither picture nor gradient."""
+    """Geometry entirely behind a surface affects neither image nor gradient."""
     wall = torch.tensor([[-4.0, -4, 1.2], [4, -4, 0.9], [4, 4, 0.8], [-4, 4, 1.1]])
     wall_faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
     behind, faces = bumpy_sphere(3)
@@ -178,7 +178,7 @@ def hidden_outlines_do_not_show(renderer: Renderer) -> None:
 
 
 def larger_than_the_frame(renderer: Renderer) -> None:
-    """Faces much larger than the image fill it, whatever the zoom."""
+    """Faces much larger than the image fill it, at any zoom."""
     vertices, faces = _grid(1, 0)
     for zoom in (3.0, 30.0, 3000.0):
         camera = replace(_front_camera(), focal=torch.full((1, 2), 2 * zoom))
@@ -188,14 +188,14 @@ def larger_than_the_frame(renderer: Renderer) -> None:
 
 
 def crossing_the_near_plane(renderer: Renderer) -> None:
-    """Faces that reach behind the camera look like the same faces cut at the near plane."""
+    """Faces that extend behind the camera look like faces clipped at the near plane."""
     camera = replace(_front_camera(), near=0.25)  # at z = 2, looking along -z
     edge = 2 - camera.near
     floor = torch.tensor([[-4.0, -1, 5], [4, -1, 5], [4, -1, -3], [-4, -1, -3]])
     cut = floor.clone()
     cut[:2, 2] = edge
     faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
-    # The cut faces' diagonal differs, so that one or two corners of a face are behind the camera.
+    # Vary the diagonal, so that one or two corners of a face are behind the camera.
     for turn in range(4):
         ahead = floor.roll(turn, 0)
         out = _render(renderer, ahead, faces, camera)
@@ -206,7 +206,7 @@ def crossing_the_near_plane(renderer: Renderer) -> None:
         if out.depth is not None and expected.depth is not None:
             both = out.depth.isfinite() & expected.depth.isfinite()
             assert torch.allclose(out.depth[both], expected.depth[both], rtol=1e-3)
-    # A triangle with one corner in front, and its part in front by itself.
+    # A triangle with one corner in front, and its front part alone.
     spike = torch.tensor([[0.1, 0.2, 0.0], [-3, -2, 4.0], [3, -2, 4.0]])
     share = (edge - spike[0, 2]) / (spike[1:, 2] - spike[0, 2])
     part = torch.cat([spike[:1], spike[:1] + share[:, None] * (spike[1:] - spike[:1])])
@@ -236,8 +236,8 @@ def depth_on_receding_quad(renderer: Renderer) -> None:
 
 
 def smooth_normals_are_perspective_correct(renderer: Renderer) -> None:
-    """Smooth shading equals normals interpolated over the face in space, computed independently."""
-    # Two quads that meet at a sharp edge and recede, so that normals turn along the depth.
+    """Smooth shading matches an independent interpolation of normals over the face in space."""
+    # Two receding quads that meet at a sharp edge, so that normals vary with depth.
     vertices = torch.tensor(
         [[-1, -1, 1], [0.2, -0.5, 1.2], [1, -1, 0.5], [-1, 1, -5], [0.2, 1.5, -4], [1, 1, -6.0]]
     )
@@ -267,7 +267,7 @@ def smooth_normals_are_perspective_correct(renderer: Renderer) -> None:
 
 
 def light_moves_with_the_camera(renderer: Renderer) -> None:
-    """Flat shading follows the formula; a tensor of lights gives each view its own."""
+    """Flat shading follows the formula; a tensor of lights sets one light per view."""
     vertices = torch.tensor([[-1, -1, 0.3], [1, -1, -0.2], [1, 1, 0.1], [-1, 1, 0.6]]) * 0.7
     faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
     cameras = _cameras(3, spread=0.2)
@@ -289,7 +289,8 @@ def light_moves_with_the_camera(renderer: Renderer) -> None:
 
 
 def several_lights_are_several_pictures(renderer: Renderer) -> None:
-    """`Renderer.render_lights`: each light's channel, and its gradient, is `render`'s."""
+    """Each channel of `Renderer.render_lights`, and its gradient, equals `render` with that
+    light."""
     vertices, faces = bumpy_sphere(1)
     cameras = _cameras(2, spread=0.2)
     lights = torch.tensor([[0.5, 0.2, 0.4], [0.0, -0.4, 0.6], [-0.6, 0.1, 0.5]])
@@ -318,7 +319,7 @@ def several_lights_are_several_pictures(renderer: Renderer) -> None:
 
 
 def everything_behind_the_camera(renderer: Renderer) -> None:
-    """Nothing to see: the background, and a gradient of zero."""
+    """With nothing visible, the image is background and the gradient is zero."""
     vertices, faces = bumpy_sphere(1)
     vertices = (vertices + torch.tensor([0, 0, 6.0])).requires_grad_()
     for normals in ("flat", "smooth"):
@@ -331,7 +332,7 @@ def everything_behind_the_camera(renderer: Renderer) -> None:
 
 
 def degenerate_faces(renderer: Renderer) -> None:
-    """Faces without area give a finite image and gradient and hide nothing."""
+    """Zero-area faces give a finite image and gradient, and occlude nothing."""
     vertices, faces = bumpy_sphere(2)
     added = torch.tensor([[0, 0, 0], [5, 5, 9], [7, 8, 7]])
     extra = torch.tensor([[0, 0, 1.2], [0.1, 0.1, 1.2], [0.2, 0.2, 1.2]])  # on one line
@@ -346,7 +347,7 @@ def degenerate_faces(renderer: Renderer) -> None:
 
 
 def camera_inside_the_mesh(renderer: Renderer) -> None:
-    """Finite image and gradient from within, whichever way the faces turn."""
+    """Image and gradient are finite from inside the mesh, for either winding."""
     vertices, faces = bumpy_sphere(2)
     camera = replace(_cameras(2), translation=torch.tensor([[0.05, 0, 0], [0.9, 0, 0.1]]))
     for winding in (faces, faces.flip(1)):
@@ -358,7 +359,7 @@ def camera_inside_the_mesh(renderer: Renderer) -> None:
 
 
 def batch_invariance(renderer: Renderer) -> None:
-    """A view does not depend on what else is in the batch."""
+    """A view doesn't depend on the rest of the batch."""
     vertices, faces = bumpy_sphere(3)
     cameras = _cameras(4)
     together = _render(renderer, vertices, faces, cameras)
@@ -370,7 +371,7 @@ def batch_invariance(renderer: Renderer) -> None:
 
 
 def face_order_invariance(renderer: Renderer) -> None:
-    """The order of the faces does not change the picture."""
+    """The order of the faces doesn't change the image."""
     vertices, faces = bumpy_sphere(3)
     order = torch.randperm(len(faces), generator=torch.Generator().manual_seed(0))
     out = _render(renderer, vertices, faces, _cameras(2))
@@ -406,7 +407,7 @@ def odd_sizes(renderer: Renderer) -> None:
 
 
 def colours_stay_in_range(renderer: Renderer) -> None:
-    """Anti-aliasing mixes colours: nothing leaves the range of surface and background."""
+    """Anti-aliasing blends colours: no value leaves the range of surface and background."""
     generator = torch.Generator().manual_seed(0)
     center = torch.rand(300, 1, 3, generator=generator) * 2 - 1
     vertices = (center + 0.15 * torch.randn(300, 3, 3, generator=generator)).view(-1, 3)
@@ -423,7 +424,7 @@ def colours_stay_in_range(renderer: Renderer) -> None:
 
 
 def shading_gradient(renderer: Renderer) -> None:
-    """The gradient of shading alone, where no outline is in the frame, against differences."""
+    """The shading gradient, with no outline in the frame, matches finite differences."""
     _need(renderer.capabilities.differentiable_shading, "shading")
     vertices, faces = bumpy_sphere(5)
     camera = replace(_cameras(1), focal=torch.full((1, 2), 12.0))
@@ -443,7 +444,7 @@ def shading_gradient(renderer: Renderer) -> None:
 
 
 def sphere_area(renderer: Renderer) -> None:
-    """A sphere's covered area, and its derivative by the radius, follow the exact formula."""
+    """A sphere's covered area, and its derivative w.r.t. the radius, match the exact formula."""
     vertices, faces = icosphere(5)
     distance, focal, radius, size = 3.0, 2.0, 0.8, 200
     camera = replace(_front_camera(), translation=torch.tensor([[0, 0, -distance]]))
@@ -459,7 +460,7 @@ def sphere_area(renderer: Renderer) -> None:
 
 
 def rough_outline(renderer: Renderer) -> None:
-    """Where many edges lie close along an outline, it still counts once: coverage by scale."""
+    """An outline with many close edges counts once: gradient of coverage w.r.t. scale."""
     _need(renderer.capabilities.differentiable_visibility, "visibility")
     vertices, faces = icosphere(5)
     generator = torch.Generator().manual_seed(0)
@@ -479,7 +480,7 @@ def rough_outline(renderer: Renderer) -> None:
 
 
 def triangle_area(renderer: Renderer) -> None:
-    """One triangle's covered area and its gradient by each corner."""
+    """A triangle's covered area, and its gradient w.r.t. each corner, match the exact values."""
     size = 128
     vertices = torch.tensor(
         [[-0.63, -0.71, 0], [0.77, -0.32, 0], [-0.11, 0.68, 0]], requires_grad=True
@@ -494,7 +495,7 @@ def triangle_area(renderer: Renderer) -> None:
     _assert_near(float(area.detach()), exact, 0.01)
     _need(renderer.capabilities.differentiable_visibility and area.requires_grad, "visibility")
     (gradient,) = torch.autograd.grad(area, vertices)
-    # A corner moves the area by half of the opposite edge, turned outwards.
+    # d area / d corner is half the opposite edge, rotated outwards.
     expected = torch.stack([(b - c)[[1, 0]], (c - a)[[1, 0]], (a - b)[[1, 0]]]) * torch.tensor(
         [0.5, -0.5]
     )
@@ -502,12 +503,12 @@ def triangle_area(renderer: Renderer) -> None:
 
 
 def gradient_of_scale(renderer: Renderer) -> None:
-    """Growing a 20k-face mesh: gradient within 10 % of an 8 times supersampled render's."""
+    """Scaling a 20k-face mesh: gradient within 10 % of an 8x supersampled render's."""
     _assert_supersampled(renderer, lambda vertices: vertices)
 
 
 def gradient_of_smooth_field(renderer: Renderer) -> None:
-    """Deforming a 20k-face mesh: gradient within 10 % of an 8 times supersampled render's."""
+    """Deforming a 20k-face mesh: gradient within 10 % of an 8x supersampled render's."""
     _assert_supersampled(renderer, _smooth_field)
 
 
@@ -549,11 +550,11 @@ CHECKS: tuple[Check, ...] = (
 def icosphere(
     subdivisions: int,
 ) -> tuple[Float[Tensor, "vertices 3"], Int[Tensor, "faces 3"]]:
-    """Unit sphere of 20 * 4**subdivisions faces, counter-clockwise from outside."""
+    """Unit sphere of 20 * 4**subdivisions faces, counter-clockwise seen from outside."""
     golden = (1 + math.sqrt(5)) / 2
     axes = [(0, a, b * golden) for a in (-1, 1) for b in (-1, 1)]
     vertices = torch.tensor([p[i:] + p[:i] for i in range(3) for p in axes], dtype=torch.float64)
-    # Three corners at the edge's length from one another make a face.
+    # Three corners one edge length apart make a face.
     near = torch.cdist(vertices, vertices).sub(2).abs() < 1e-6
     faces = torch.combinations(torch.arange(12), 3)
     a, b, c = faces.unbind(1)
@@ -582,7 +583,7 @@ def bumpy_sphere(
 
 
 def _grid(cells: int, seed: int) -> tuple[Tensor, Tensor]:
-    """A square of 2 * cells**2 faces at z = 0, its inner vertices jittered."""
+    """A square of 2 * cells**2 faces at z = 0, with jittered inner vertices."""
     steps = torch.linspace(-0.8, 0.8, cells + 1)
     y, x = torch.meshgrid(steps, steps, indexing="ij")
     vertices = torch.stack([x, y, torch.zeros_like(x)], 2)
@@ -604,7 +605,7 @@ def _triangle(z: float = 0.0) -> Tensor:
 
 
 def _front_camera(from_behind: bool = False) -> Cameras:
-    """Two units from the origin, on +z (or -z): there, world units in z = 0 are NDC units."""
+    """Camera on +z (or -z), two units from the origin: world units at z = 0 are NDC units."""
     turn = torch.diag(torch.tensor([-1.0, 1, -1])) if from_behind else torch.eye(3)
     return Cameras(
         turn[None], torch.tensor([[0, 0, -2.0]]), torch.full((1, 2), 2.0), torch.zeros(1, 2)
@@ -612,7 +613,7 @@ def _front_camera(from_behind: bool = False) -> Cameras:
 
 
 def _cameras(count: int, focal: float = 2.2, spread: float = 1.0) -> Cameras:
-    """Around the origin at distance 2.5, the first in front, at various heights."""
+    """Cameras around the origin at distance 2.5 and various heights, the first in front."""
     azimuth = torch.arange(count) * (2 * math.pi / count) * spread + 0.2
     height = 0.4 * torch.sin(torch.arange(count) * 1.7 + 0.5)
     backward = torch.stack(
@@ -632,7 +633,7 @@ def _render(
     shading: Shading | None = None,
     size: tuple[int, int] = (32, 32),
 ) -> RenderOutput:
-    """Render on the backend's first device, and bring the result back to the CPU."""
+    """Render on the backend's first device, and return the result on the CPU."""
     device = renderer.capabilities.devices[0]
     out = renderer.render(
         vertices.to(device),
@@ -663,7 +664,7 @@ def _ids(out: RenderOutput) -> Tensor:
 
 def _need(claimed: bool, what: str) -> None:
     if not claimed:
-        raise NotApplicable(f"does not differentiate {what}")
+        raise NotApplicable(f"is not differentiable w.r.t. {what}")
 
 
 def _need_ties(renderer: Renderer) -> None:
@@ -699,11 +700,11 @@ def _assert_finite(renderer: Renderer, out: RenderOutput, vertices: Tensor) -> N
 
 
 def _assert_near(found: float, expected: float, relative: float) -> None:
-    assert abs(found - expected) <= relative * abs(expected), f"{found} instead of {expected}"
+    assert abs(found - expected) <= relative * abs(expected), f"{found}, expected {expected}"
 
 
 def _weight(size: int) -> Tensor:
-    """A smooth weight of the pixels, so that no symmetry cancels."""
+    """Smooth pixel weights, so that no symmetry cancels."""
     y, x = torch.meshgrid(*[torch.linspace(0, 1, size)] * 2, indexing="ij")
     return torch.cos(5 * x + 1) * torch.sin(4 * y + 0.3) + 0.7
 
@@ -735,9 +736,9 @@ def _assert_supersampled(renderer: Renderer, field: Callable[[Tensor], Tensor]) 
 
 
 def conformance_table() -> str:
-    """Markdown: every check for every registered renderer, with the reason of each that is no pass.
+    """Markdown table of every check for every registered renderer, with reasons for non-passes.
 
-    ``python -m styleexp.testing`` prints the page that it is part of.
+    ``python -m styleexp.testing`` prints the whole page.
     """
     from styleexp import plugins
 

@@ -1,6 +1,6 @@
-"""What was asked for and changes nothing, since the chosen method doesn't read it.
+"""Overrides that have no effect, because the chosen method doesn't read them.
 
-A baseline's `Spec` says what it reads. The learned methods read every key.
+A baseline's `Spec` lists the keys it reads. The learned methods read every key.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ EVERY_RUN = (
     "source", "style", "baseline", "optim.seed", "preview", "metrics", "logger", "report",
     "strength", "device", "threads", "debug",
 )  # fmt: skip
-"""What is read whatever the method."""
+"""Keys that every method reads."""
 FOR_RENDERS = ("style.image_contrast", "style.image_match_mean")
-"""What is read only to compare a picture with renders, although it is a key of ``style``."""
+"""Keys of ``style`` that are only read to compare an image with renders."""
 PARTS = ("renderer", "encoder", "field", "loss")
-"""Keys that also choose the part of that name."""
+"""Keys that also select a part."""
 
 
 def note(configs: Iterable[Config], given: Sequence[str]) -> str | None:
-    """One sentence on those of the given overrides that change nothing in any of these runs; None
-    where there are none."""
+    """One sentence on the given overrides that have no effect in any of these runs; None if there
+    are none."""
     specs = {}
     idle = list(given)
     for config in configs:
@@ -55,7 +55,7 @@ def _baseline(config: Config) -> Spec | None:
 
 
 def _is_unread(override: str, read: Sequence[str]) -> bool:
-    """Whether an override sets keys of the configuration, and none that is ``read``."""
+    """Whether an override sets keys of the configuration, but none that is ``read``."""
     found = re.match(r"[+~]*([\w./-]+)(?:@[^=]*)?(?:=(.*))?", override, re.DOTALL)
     keys = _keys(found[1], found[2] or "") if found else []
     return bool(keys) and not any(
@@ -71,7 +71,7 @@ def _covers(key: str, other: str) -> bool:
 
 
 def _keys(key: str, value: str) -> list[str]:
-    """The keys that an override sets; none where it chooses more, as ``method`` does."""
+    """Keys that an override sets; empty if it selects whole presets, as ``method`` does."""
     if key in PARTS:
         return [f"{key}.name"]
     if key.split(".")[0] in {each.name for each in fields(Config)}:
@@ -81,8 +81,8 @@ def _keys(key: str, value: str) -> list[str]:
 
 
 def _keys_of_preset(group: str, name: str) -> list[str]:
-    """The keys that a file of ``conf`` sets, such as ``profile/fast.yaml``; none where it chooses
-    among other files, or sweeps."""
+    """Keys that a file of ``conf`` sets, such as ``profile/fast.yaml``; empty if it selects other
+    files, or sweeps."""
     from omegaconf import OmegaConf
 
     from styleexp.reports.folders import flatten

@@ -1,4 +1,4 @@
-"""What is seen of a mesh in one step: its global and its local views (Sec. 3.3.1)."""
+"""Global and local views of a mesh in one step (Sec. 3.3.1)."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ if TYPE_CHECKING:
     from styleexp.renderers.base import Cameras, Renderer, Shading
 
 SURFACE_BANK = 192
-"""How many surface points the local views of a run are drawn from."""
+"""Number of surface points that a run's local views are drawn from."""
 
 
 @dataclass(frozen=True)
 class Images:
-    """Pictures for the encoder and which of their pixels show the mesh."""
+    """Images for the encoder, and which of their pixels show the mesh."""
 
     image: Float[Tensor, "n height width channels"]
     coverage: Float[Tensor, "n height width"]
 
 
 class Viewer:
-    """Renders a mesh's views for any step; equal seeds see equal views.
+    """Renders a mesh's views for any step; equal seeds give equal views.
 
-    ``scale`` enlarges what is seen: the style mesh is shown larger to make its pattern come out
-    larger on the result. Images have a channel for each of the ``lights``, which stand evenly
-    about the viewing axis; the first is that of ``shading``.
+    ``scale`` magnifies the mesh: showing the style larger makes its pattern larger on the result.
+    Images have one channel per light; the ``lights`` are evenly spaced about the viewing axis,
+    starting with that of ``shading``.
     """
 
     def __init__(
@@ -125,14 +125,14 @@ class Viewer:
             return seen
         fill = self.config.perspective_fill
         fill = self.shading.background if fill is None else fill
-        # The fill is an image's; shifted by it, coverage comes out as 0 beyond the frame.
+        # The fill value is an image's; shifting by it makes coverage 0 outside the frame.
         both = torch.cat([seen.image, seen.coverage[..., None] + fill], dim=-1)
         both = views.random_perspective(self.config, both, fill, generator)
         return Images(both[..., :-1], both[..., -1] - fill)
 
 
 def turned_light(shading: Shading, degrees: Float[Tensor, " views"]) -> Float[Tensor, "views 3"]:
-    """The light turned about the viewing axis, for each view by its own angle."""
+    """Rotate the light about the viewing axis, by one angle per view."""
     x, y, z = torch.as_tensor(shading.light, dtype=torch.float32)
     angle = degrees.deg2rad()
     cos, sin = angle.cos(), angle.sin()

@@ -1,4 +1,4 @@
-"""Where the cameras stand, and the image views taken of their renders (Sec. 3.3.1, Eq. 2)."""
+"""Camera placement, and crops and perspectives of the renders (Sec. 3.3.1, Eq. 2)."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
     from styleexp.renderers.base import Renderer, Shading
 
 POLE_GUARD = math.radians(85.0)
-"""Elevations are kept within this; at 90 degrees the up vector is degenerate."""
+"""Maximum elevation in radians; at 90 degrees the up vector is degenerate."""
 
 SURFACE_FOV = 40.0
 """Field of view, in degrees, of the cameras aimed at surface points."""
 
 
 def step_generator(seed: int, step: int, stream: int = 0) -> torch.Generator:
-    """A generator that depends on (seed, step, stream) alone, so that a resumed run draws the same
-    numbers as one that was not interrupted."""
+    """A generator that depends only on (seed, step, stream), so that a resumed run draws the same
+    numbers as an uninterrupted one."""
     generator = torch.Generator()
     generator.manual_seed(((seed * 1_000_003 + step) * 1_009 + stream) % (1 << 63))
     return generator
@@ -41,8 +41,8 @@ def look_at(
     fov: float,
     up: tuple[float, float, float] = (0.0, 1.0, 0.0),
 ) -> Cameras:
-    """Cameras at ``eye`` looking at ``target``; ``fov`` in degrees. Where the direction is within
-    10 degrees of ``up``, -Z serves as up instead."""
+    """Cameras at ``eye`` looking at ``target``; ``fov`` in degrees. If the direction is within 10
+    degrees of ``up``, -Z is used as up."""
     backward = functional.normalize(eye - target, dim=1)
     ups = torch.tensor(up, dtype=eye.dtype, device=eye.device).expand_as(eye)
     degenerate = (backward * ups).sum(1, keepdim=True).abs() > math.cos(math.radians(10.0))
@@ -81,7 +81,7 @@ def orbit(
 def sample_global(
     config: ViewsConfig, generator: torch.Generator, device: torch.device, count: int | None = None
 ) -> Cameras:
-    """Random global views; the first is exactly the centre when ``spread`` is ``normal``."""
+    """Random global views; with ``spread`` ``normal`` the first is exactly the centre."""
     count = config.count if count is None else count
     center = torch.tensor([math.radians(config.elevation), math.radians(config.azimuth)])
     std = torch.tensor([math.radians(config.elevation_std), math.radians(config.azimuth_std)])
@@ -95,7 +95,7 @@ def sample_global(
 
 
 def zoom(cameras: Cameras, factor: float) -> Cameras:
-    """The same cameras with everything ``factor`` times as large in the image."""
+    """Zoom in: everything appears ``factor`` times as large."""
     return replace(cameras, focal=cameras.focal * factor)
 
 
@@ -103,7 +103,7 @@ def crop_cameras(
     cameras: Cameras, windows: Float[Tensor, "crops 3"], view: Int[Tensor, " crops"]
 ) -> Cameras:
     """Cameras that see only a window of a view: rows are (x, y, share), the centre in NDC and the
-    side as a share of the frame."""
+    side as a fraction of the frame."""
     parent = cameras[view]
     share = windows[:, 2:3]
     return replace(
@@ -114,7 +114,7 @@ def crop_cameras(
 def crop_windows(
     config: LocalViewsConfig, views: int, generator: torch.Generator
 ) -> tuple[Float[Tensor, "crops 3"], Int[Tensor, " crops"]]:
-    """Random windows inside the frame, ``per_view`` for each view, and the view each belongs to."""
+    """Random windows inside the frame, ``per_view`` per view, and the view each belongs to."""
     side = config.share if config.crop == "side" else math.sqrt(config.share)
     count = views * config.per_view
     centers = (2 * torch.rand(count, 2, generator=generator) - 1) * (1 - side)
@@ -144,8 +144,8 @@ def random_perspective(
     fill: float,
     generator: torch.Generator,
 ) -> Float[Tensor, "n height width channels"]:
-    """omega_global: every corner is drawn inwards by up to ``perspective`` half-frames, with the
-    configured probability; what comes in from outside is ``fill``."""
+    """omega_global: with the configured probability, move every corner inwards by up to
+    ``perspective`` half-frames; pixels from outside the frame are ``fill``."""
     if config.perspective == 0:
         return images
     count = len(images)
@@ -174,7 +174,7 @@ def random_perspective(
 def homography(
     source: Float[Tensor, "n 4 2"], target: Float[Tensor, "n 4 2"]
 ) -> Float[Tensor, "n 3 3"]:
-    """The projective maps that take four points to four others."""
+    """Projective maps from four source points to four target points."""
     count = len(source)
     x, y = source[..., 0].double(), source[..., 1].double()
     u, v = target[..., 0].double(), target[..., 1].double()
@@ -194,12 +194,12 @@ def surface_cameras(
     renderer: Renderer,
     shading: Shading,
 ) -> Cameras:
-    """Cameras that look straight down at random surface points from close by.
+    """Close-up cameras that look straight down at random surface points.
 
-    The window is ``extent`` wide at the surface, so the pattern has the same size in the image
-    wherever it lies: heads and limbs count as much as backs, and foreshortening is gone. World +Y
-    stays up, which keeps the direction of stripes. Points hidden from their camera by another part
-    of the mesh are left out; what remains is at most ``count`` cameras.
+    The window is ``extent`` wide at the surface, so the pattern has the same size in every image:
+    heads and limbs count as much as backs, and there is no foreshortening. World +Y stays up, which
+    keeps the direction of stripes. Points occluded by another part of the mesh are dropped, so
+    there are at most ``count`` cameras.
     """
     points, directions = sample_surface(surface, 2 * count, generator)
     distance = extent / (2 * math.tan(math.radians(SURFACE_FOV) / 2))

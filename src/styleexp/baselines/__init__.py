@@ -1,10 +1,10 @@
-"""The methods beside the learned one: synthesis, the default, and those that the paper compares
-with (Sec. 4.2.3), run by the same command into the same run folder.
+"""Methods other than the learned one: synthesis, the default, and the paper's baselines (Sec.
+4.2.3). All run with the same command and write the same run folder.
 
-A baseline is what `styleexp.stylize` is, the four functions of a `Method`: the command line and
-``styleexp.stylize(...)`` call nothing else of either. ``config.baseline`` names it, ``conf/method``
-has a preset for each. Two baselines need no code here: ``method=vertex`` is a field, and
-``method=text2mesh`` an encoder and a loss, of the same loop.
+A baseline implements the four functions of `Method`, like the module `styleexp.stylize`; callers
+use nothing else. ``config.baseline`` names it, and ``conf/method`` has a preset for each. Two
+baselines need no code here and use the usual loop: ``method=vertex`` is a field, and
+``method=text2mesh`` an encoder and a loss.
 """
 
 from __future__ import annotations
@@ -19,36 +19,38 @@ if TYPE_CHECKING:
 
 
 class Method(Protocol):
-    """How a source mesh gets its style. ``config.optim.steps`` steps, or none."""
+    """A stylisation method, with ``config.optim.steps`` steps or none."""
 
     def prepare(self, config: Config) -> Any:
-        """Load what the run needs: a `scene.Subject`, which `scene.load` makes."""
+        """Load the run's inputs as a `scene.Subject`; see `scene.load`."""
         ...
 
     def start(self, scene: Any) -> Any:
-        """The state before the first step, a `stylize.State`: a checkpoint holds all its tensors.
+        """State before the first step, a `stylize.State`, whose tensors are checkpointed.
 
-        None for a method without steps, and therefore without checkpoints.
+        None for a method without steps, which has no checkpoints.
         """
         ...
 
     def optimise(self, scene: Any, state: Any) -> Iterator[Any]:
-        """Take the steps from ``state.step`` on, yielding a dataclass after each.
+        """Run the steps from ``state.step`` on, yielding a dataclass after each.
 
-        Its fields are a line of ``metrics.jsonl``; ``step``, ``loss`` and ``seconds`` are shown.
-        Random numbers come from `views.step_generator`, so that a resumed run draws the same.
+        Its fields form a line of ``metrics.jsonl``; ``step``, ``loss`` and ``seconds`` are
+        displayed. Draw random numbers from `views.step_generator`, so that resumed runs are
+        reproducible.
         """
         ...
 
     def finish(self, scene: Any, state: Any) -> Result:
-        """The generated mesh; where ``scene.mask`` is 0, the source. Where it has other faces than
-        the source, the result's ``scene`` has a source that has them too, in the same frame."""
+        """Return the generated mesh, which equals the source where ``scene.mask`` is 0. If its
+        faces differ from the source's, the result's ``scene`` has a source with these faces, in the
+        same frame."""
         ...
 
 
 def method(config: Config) -> Method:
-    """The baseline that ``config`` names, or the learned method."""
-    from styleexp import plugins  # which lists the baselines, so it can't be imported above
+    """Return the baseline named in ``config``, or the learned method."""
+    from styleexp import plugins  # circular: plugins lists the baselines
 
     if config.baseline is None:
         return cast(Method, importlib.import_module("styleexp.stylize"))

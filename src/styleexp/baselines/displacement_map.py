@@ -1,4 +1,4 @@
-"""The height map laid on the source, and no more: see `styleexp.height_maps`."""
+"""Baseline that only applies the style's height map: see `styleexp.height_maps`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class DisplacementMap:
-    """The baseline: see the module."""
+    """The displacement-map baseline: see the module."""
 
     def __init__(self, config: DisplacementMapConfig):
         self.config = config
@@ -30,18 +30,18 @@ class DisplacementMap:
             raise UserError(f"baseline.sharpness={config.sharpness} is not allowed: give 1 to 64.")
 
     def prepare(self, config: Config) -> Subject:
-        """Source and style; neither renderer nor encoder."""
+        """Load source and style; needs neither renderer nor encoder."""
         return load(config)
 
     def start(self, scene: Subject) -> None:
-        """There are no steps."""
+        """Return None: there are no steps."""
 
     def optimise(self, scene: Subject, state: None) -> Iterator[Step]:
-        """No step."""
+        """Yield nothing: there are no steps."""
         return iter(())
 
     def finish(self, scene: Subject, state: None) -> Result:
-        """Displace the source by the map; zero on average over the surface."""
+        """Displace the source by the map, with zero mean over the surface."""
         options = self.config
         raised = displacement(scene, options.height, options.patch, options.sharpness).double()
         raised = masked(raised, scene.mask)

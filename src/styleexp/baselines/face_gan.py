@@ -1,8 +1,8 @@
-"""Networks on the faces of a triangle mesh: a generator of displacements, and its critic.
+"""Networks on mesh faces: a generator of displacements, and its critic.
 
-They see a displacement field of the vertices around each face, in the face's own frame, and so work
-alike wherever a face lies and however it is turned. A face has three neighbours in a cyclic order
-without a first one: a layer averages what it makes of each of the three orders.
+Inputs are the displacements of the vertices around each face, in the face's local frame, so the
+networks are invariant to translation and rotation. A face's three neighbours have a cyclic order
+without a start, so a layer averages its output over the three cyclic orders.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ if TYPE_CHECKING:
     from styleexp.baselines.pyramid import Level
 
 POINTS = 6
-"""What a face sees: its corners, and the vertices across its edges."""
+"""Points per face: its corners, and the vertices across its edges."""
 
 SLOPE = 0.2
-"""Of the leaky rectifiers."""
+"""Negative slope of the leaky ReLUs."""
 
 
 @dataclass(frozen=True)
 class Patch:
-    """Some faces of a level, or all."""
+    """Some or all faces of a level."""
 
     faces: Int[Tensor, "faces 3"]
     points: Int[Tensor, "faces 6"]
     """Corners, then the vertices across the edges."""
     frames: Float[Tensor, "faces corners xyz 3"]
     neighbours: Int[Tensor, "faces 3"]
-    """Numbered within the patch; the face itself where the neighbour is not in it."""
+    """Adjacent faces, indexed within the patch; the face itself if the neighbour is outside."""
 
     @staticmethod
     def of(level: Level, chosen: Int[Tensor, " faces"] | None = None) -> Patch:
-        """The patch of the chosen faces, of all by default."""
+        """The patch of the chosen faces, by default all."""
         points = torch.cat([level.faces, level.opposite], dim=1)
         if chosen is None:
             return Patch(level.faces, points, level.frames, level.neighbours)
@@ -54,7 +54,7 @@ class Patch:
         return Patch(level.faces[chosen], points[chosen], level.frames[chosen], across)
 
     def seen(self, field: Float[Tensor, "vertices 3"]) -> Float[Tensor, "faces corners 18"]:
-        """The field at each face's points in each corner's frame, that corner's point first."""
+        """The field at each face's points, in each corner's frame, starting with that corner."""
         points = field.index_select(0, self.points.reshape(-1)).reshape(-1, POINTS, 3)
         local = torch.einsum("fkij,fpj->fkpi", self.frames, points)
         turned = [
@@ -66,7 +66,7 @@ class Patch:
     def spread(
         self, local: Float[Tensor, "faces corners 3"], vertices: int
     ) -> Float[Tensor, "vertices 3"]:
-        """Vectors of corners, each in its frame, averaged at their vertices; elsewhere zero."""
+        """Average per-corner vectors, given in corner frames, at the vertices; zero elsewhere."""
         vectors = torch.einsum("fkij,fki->fkj", self.frames, local).reshape(-1, 3)
         corners = self.faces.reshape(-1)
         total = vectors.new_zeros(vertices, 3).index_add(0, corners, vectors)
@@ -75,7 +75,7 @@ class Patch:
 
 
 class FaceOrders(nn.Module):
-    """A linear map of each face and its three neighbours, in each of their three orders."""
+    """Linear map of each face and its three neighbours, for each of their three cyclic orders."""
 
     def __init__(self, inputs: int, outputs: int):
         super().__init__()
@@ -85,13 +85,13 @@ class FaceOrders(nn.Module):
     def forward(
         self, x: Float[Tensor, "faces inputs"], neighbours: Int[Tensor, "faces 3"]
     ) -> Float[Tensor, "faces orders outputs"]:
-        """Order k has neighbour k first."""
+        """Apply the map; order k starts with neighbour k."""
         return torch.stack(self.orders(x, neighbours), dim=1)
 
     def orders(self, x: Tensor, neighbours: Tensor) -> list[Float[Tensor, "faces outputs"]]:
-        """The same as a list."""
+        """Output for each order, as a list."""
         own = self.own(x)
-        # One gather, and views of it: neighbour n at place j is part 3 n + j.
+        # One gather and views of it: neighbour n at position j is part 3 n + j.
         parts = self.ring(x).index_select(0, neighbours.reshape(-1))
         part = parts.reshape(len(x), 9, -1).unbind(1)
         return [
@@ -101,7 +101,7 @@ class FaceOrders(nn.Module):
 
 
 class FaceNet(nn.Module):
-    """Features of faces: what they see, then face convolutions with residual connections."""
+    """Face features: an input layer, then residual face convolutions."""
 
     def __init__(self, width: int, depth: int):
         super().__init__()
@@ -111,7 +111,7 @@ class FaceNet(nn.Module):
     def forward(
         self, seen: Float[Tensor, "faces corners 18"], neighbours: Int[Tensor, "faces 3"]
     ) -> Float[Tensor, "faces width"]:
-        """One row per face, the same however its corners are numbered."""
+        """One row per face, invariant to the numbering of its corners."""
         x = _pooled(self.see(seen).unbind(1))
         for conv in self.convs:
             assert isinstance(conv, FaceOrders)
@@ -125,7 +125,7 @@ def _pooled(three: Sequence[Tensor]) -> Tensor:
 
 
 class Generator(nn.Module):
-    """Adds detail to a displacement field; adds nothing before it is trained."""
+    """Adds detail to a displacement field; initialised to add nothing."""
 
     def __init__(self, width: int, depth: int):
         super().__init__()
@@ -139,14 +139,14 @@ class Generator(nn.Module):
     def forward(
         self, patch: Patch, field: Float[Tensor, "vertices 3"]
     ) -> Float[Tensor, "vertices 3"]:
-        """The detail, at the patch's vertices; both fields in units of about their own size."""
+        """Detail at the patch's vertices; both fields are normalised to unit scale."""
         seen = patch.seen(field)
         local = self.out(self.net(seen, patch.neighbours), patch.neighbours) + self.skip(seen)
         return patch.spread(local, len(field))
 
 
 class Critic(nn.Module):
-    """Scores each face by what is around it: high for the exemplar's."""
+    """Scores each face by its surroundings; high for the exemplar's."""
 
     def __init__(self, width: int, depth: int):
         super().__init__()
@@ -167,7 +167,7 @@ def gradient_penalty(
     fake: Float[Tensor, "faces corners 18"],
     mix: float,
 ) -> Float[Tensor, ""]:
-    """WGAN-GP: how far the critic's slope, face by face, is from 1 between real and fake."""
+    """WGAN-GP: deviation of the critic's per-face gradient norm from 1, between real and fake."""
     between = (mix * real + (1 - mix) * fake).detach().requires_grad_(True)
     score = critic(between, patch.neighbours).sum()
     (slope,) = torch.autograd.grad(score, between, create_graph=True)

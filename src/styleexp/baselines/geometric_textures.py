@@ -1,11 +1,11 @@
-"""Geometric textures from a GAN on triangles, after Hertz et al. 2020, compact and for a CPU.
+"""Geometric textures from a GAN on triangles, after Hertz et al. 2020, scaled down for a CPU.
 
-*Deep Geometric Texture Synthesis* learns from one exemplar: at each of several levels of
-subdivision a generator on faces displaces the vertices, in any direction, and a critic on faces
-tells the result from the exemplar at that level (WGAN-GP; a reconstruction from one fixed noise
-keeps the generator steady). Levels are trained one after the other, the coarsest first. Then the
-generators displace another mesh, level by level. Written from the paper's description; where this
-differs from it: docs/baselines.md.
+*Deep Geometric Texture Synthesis* learns from one exemplar. At each of several subdivision levels,
+a generator on faces displaces the vertices in any direction, and a critic on faces distinguishes
+the result from the exemplar at that level (WGAN-GP; reconstruction from one fixed noise stabilises
+the generator). Levels are trained one after the other, from coarse to fine. The generators then
+displace another mesh, level by level. Written from the paper's description; docs/baselines.md lists
+the differences.
 """
 
 from __future__ import annotations
@@ -41,22 +41,24 @@ if TYPE_CHECKING:
     Project = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 NOISE = (1.0, 0.3)
-"""Added to the lowest level's input and to the others', in root mean squares of the exemplar."""
+"""Noise added to the input of the lowest level and of the others, relative to the exemplar's
+RMS."""
 
 PENALTY, RECONSTRUCTION = 1.0, 10.0
 """Weights of the gradient penalty and of the reconstruction."""
 
 INNER = 0.5
-"""Share of a patch's faces, the innermost, that the critic sees: at the rim neighbours lack."""
+"""Fraction of a patch's faces, the innermost, that the critic sees; rim faces lack neighbours."""
 
 SMOOTH_LENGTH = 0.5
-"""What is larger than this, in radii of a style mesh, is its shape, not its texture."""
+"""Length, in radii of the style mesh, above which features count as shape, not texture."""
 
 TRAIN, RECALL, APPLY = 12, 13, 14
 """Streams of random numbers: training, the fixed noise, and the result's."""
 
 LEAST_VERTICES, MOST_VERTICES = 20, 1_000_000
-"""Of source and style: at the lowest level, at the highest."""
+"""Limits on the vertices of source and style: minimum at the lowest level, maximum at the
+highest."""
 
 LIMITS = {
     "levels": (1, 6),
@@ -67,39 +69,38 @@ LIMITS = {
     "width": (4, 512),
     "depth": (1, 16),
 }
-"""Of the options."""
+"""Allowed ranges of the options."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TextureScene(Subject):
-    """The exemplar and the source at every level. The subject's source is the finest of the
-    latter."""
+    """Exemplar and source at every level. The subject's source is the source's finest level."""
 
     exemplar: list[Level]
     fields: list[Tensor]
-    """The exemplar's texture at each level (vertices, 3): displacements, in radii of the style."""
+    """The exemplar's texture per level: displacements (vertices, 3), in radii of the style."""
     levels: list[Level]
-    """Of the source; in radii of the normalised source."""
+    """The source's levels, in radii of the normalised source."""
 
 
 @dataclass(frozen=True)
 class TextureStep:
-    """Means over the iterations of one step."""
+    """Measurements, averaged over the iterations of one step."""
 
     step: int
     level: int
     loss: float
-    """The generator's."""
+    """The generator's loss."""
     critic: float
-    """How much higher the critic scores the exemplar than what is generated."""
+    """Critic score of the exemplar minus that of the generated texture."""
     penalty: float
     reconstruction: float
-    """Mean square error, over the mean square of the exemplar's texture."""
+    """Mean squared error, relative to the mean square of the exemplar's texture."""
     seconds: float = field(compare=False)
 
 
 class GeometricTextures:
-    """The baseline: see the module."""
+    """The geometric-textures baseline: see the module."""
 
     def __init__(self, config: GeometricTexturesConfig):
         self.config = config
@@ -112,13 +113,13 @@ class GeometricTextures:
         check_size("style", config.base, config.levels)
 
     def prepare(self, config: Config) -> TextureScene:
-        """Exemplar and source, subdivided."""
+        """Load and subdivide exemplar and source."""
         subject = load(config)
         if not isinstance(subject.style, meshes.Mesh):
             raise UserError(
                 "method=geometric_textures learns from a mesh, and the style "
-                f"'{config.style.path or config.style.name}' is a picture: choose a mesh as style, "
-                "or another method."
+                f"'{config.style.path or config.style.name}' is a picture: give a mesh as style, "
+                "or choose another method."
             )
         if config.optim.steps < self.config.levels:
             raise UserError(
@@ -127,7 +128,7 @@ class GeometricTextures:
             )
         device = subject.surface.vertices.device
         exemplar, fields = fit_exemplar(subject.style, self.config.base, self.config.levels, device)
-        # Triangles of the size, in the pattern, that the exemplar's have.
+        # Triangles of the exemplar's size, relative to the pattern.
         area = float(_area(subject.surface.vertices, subject.surface.faces))
         own = float(_area(exemplar[0].base, exemplar[0].faces)) * subject.unit**2
         count = round(len(exemplar[0].base) * area / own)
@@ -146,7 +147,7 @@ class GeometricTextures:
         normals = meshes.vertex_normals(source.vertices, source.faces)
         surface = Surface(finest.base, finest.faces, torch.from_numpy(normals).float().to(device))
         note = (
-            f"the result is not on the source's own faces: '{source.name}' was resampled to "
+            f"the result doesn't have the source's own faces: '{source.name}' was resampled to "
             f"{len(levels[0].base)} vertices and subdivided to {len(finest.base)}"
         )
         changed = {"source": source, "surface": surface, "areas": vertex_areas(surface)}
@@ -156,7 +157,7 @@ class GeometricTextures:
         )
 
     def start(self, scene: TextureScene) -> State:
-        """Untrained networks, a generator and a critic for each level."""
+        """Untrained networks: a generator and a critic per level."""
         optim = scene.config.optim
         width, depth = self.config.width, self.config.depth
         with torch.random.fork_rng(devices=[]):
@@ -166,12 +167,12 @@ class GeometricTextures:
             nn.ModuleDict({"generator": generator, "critic": critic}) for generator, critic in pairs
         )
         networks.to(scene.surface.vertices.device)
-        # One optimiser for all: it leaves alone what has no gradient.
+        # One optimiser for all: it skips parameters without a gradient.
         adam = torch.optim.Adam(networks.parameters(), lr=optim.rate, betas=(0.5, 0.999))
         return State(networks, adam)
 
     def optimise(self, scene: TextureScene, state: State) -> Iterator[TextureStep]:
-        """Train level after level, an equal share of the steps each."""
+        """Train one level after the other, each for an equal share of the steps."""
         optim, count = scene.config.optim, len(scene.exemplar)
         while state.step < optim.steps:
             begun = time.perf_counter()
@@ -201,7 +202,7 @@ class GeometricTextures:
         recalled: Tensor,
         random: torch.Generator,
     ) -> tuple[float, float, float, float]:
-        """One update of a level's generator after some of its critic, on one patch."""
+        """One generator update after several critic updates, on one patch of a level."""
         level, target = scene.exemplar[number], scene.fields[number]
         generator, critic = state.field[number]["generator"], state.field[number]["critic"]
         unit = _unit(target)
@@ -229,7 +230,7 @@ class GeometricTextures:
         return loss.item(), gap.item(), penalty.item(), error.item()
 
     def _update(self, state: State, loss: Tensor, network: nn.Module) -> None:
-        """Step on one network alone."""
+        """Update one network only."""
         parameters = list(network.parameters())
         state.optimizer.zero_grad(set_to_none=True)
         for parameter, grad in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
@@ -238,7 +239,7 @@ class GeometricTextures:
 
     @torch.no_grad()
     def finish(self, scene: TextureScene, state: State) -> Result:
-        """The generators, level by level, on the source."""
+        """Apply the generators to the source, level by level."""
         random = step_generator(scene.config.optim.seed, 0, stream=APPLY)
         texture = torch.zeros_like(scene.levels[0].base)
         for number, level in enumerate(scene.levels):
@@ -252,20 +253,19 @@ class GeometricTextures:
 
 
 def check_size(what: str, lowest: int, levels: int) -> None:
-    """Raise `UserError` for a mesh that is too coarse at the lowest level, or too fine at the
-    highest."""
+    """Raise `UserError` if a mesh is too coarse at the lowest level, or too fine at the highest."""
     highest = lowest * 4 ** (levels - 1)
     if lowest < LEAST_VERTICES or highest > MOST_VERTICES:
         raise UserError(
-            f"the {what} would get {lowest} vertices at the lowest level and {highest} at the "
-            f"highest, which must be {LEAST_VERTICES} at least and {MOST_VERTICES} at most: change "
-            "baseline.base, baseline.levels or style.scale."
+            f"the {what} would get {lowest} vertices at the lowest level (at least "
+            f"{LEAST_VERTICES} needed) and {highest} at the highest (at most {MOST_VERTICES} "
+            "allowed): change baseline.base, baseline.levels or style.scale."
         )
 
 
 def choose_patch(level: Level, size: int, random: torch.Generator) -> tuple[Patch, Patch]:
-    """About ``size`` faces around a random one, and the innermost of them; all if there are no
-    more."""
+    """About ``size`` faces around a random face (or all, if there are fewer), and the innermost of
+    them."""
     centre = int(torch.randint(len(level.faces), (1,), generator=random))
     if len(level.faces) <= size:
         whole = Patch.of(level)
@@ -278,8 +278,8 @@ def choose_patch(level: Level, size: int, random: torch.Generator) -> tuple[Patc
 def _below(
     scene: TextureScene, networks: nn.ModuleList, number: int, random: torch.Generator | None
 ) -> Float[Tensor, "vertices 3"]:
-    """The exemplar's texture as the levels below ``number`` generate it, subdivided; without
-    ``random`` from the fixed noise."""
+    """The exemplar's texture generated by the levels below ``number``, upsampled; without
+    ``random``, from the fixed noise."""
     texture = torch.zeros_like(scene.exemplar[0].base)
     for below in range(number):
         texture = _detailed(scene, networks, below, scene.exemplar[below], texture, random)
@@ -306,7 +306,7 @@ def _detailed(
 
 
 def _unit(texture: Tensor) -> Tensor:
-    """The networks see a level's displacements in its exemplar's root mean squares."""
+    """RMS of a texture, which normalises the networks' displacements."""
     return texture.square().sum(1).mean().sqrt().clamp(min=1e-9)
 
 
@@ -321,10 +321,11 @@ def _fixed_noise(scene: TextureScene, like: Tensor) -> Tensor:
 def fit_exemplar(
     style: meshes.Mesh, base: int, levels: int, device: torch.device
 ) -> tuple[list[Level], list[Float[Tensor, "vertices 3"]]]:
-    """The style with subdivision connectivity, and its texture at each level, in its own radii.
+    """The style with subdivision connectivity, and its texture per level, in radii of the style.
 
-    An analytic style is its relief on a sphere. Of any other mesh the smoothed surface is resampled
-    and subdivided, and its texture is where the mesh itself lies: no optimisation is needed.
+    An analytic style is a sphere with its relief. For any other mesh, the smoothed surface is
+    resampled and subdivided, and the texture is the offset to the mesh itself; no optimisation is
+    needed.
     """
     frame = meshes.normalisation(style.vertices)
     if style.carrier is None and style.name in shapes.RELIEFS:
@@ -355,8 +356,8 @@ def fit_exemplar(
 def _resampled(
     name: str, vertices: np.ndarray, faces: np.ndarray, count: int
 ) -> tuple[tuple[np.ndarray, np.ndarray], Project]:
-    """About ``count`` even vertices on a surface, and the projection of points onto it: the points,
-    their faces, and their barycentric weights there."""
+    """Resample a surface to about ``count`` uniform vertices, and project points onto it: returns
+    the points, their faces and barycentric weights."""
     import gpytoolbox
 
     triangles = faces.astype(np.int32)

@@ -1,4 +1,4 @@
-"""A surface at several levels of subdivision, and its faces' frames and neighbours."""
+"""A surface at several subdivision levels, with frames and neighbours of its faces."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Level:
-    """One level: an even triangle mesh. Corner k of a face is followed by corner k + 1 (mod 3),
-    and edge k goes from the one to the other."""
+    """One level: a uniform triangle mesh. Edge k of a face goes from corner k to corner k + 1 (mod
+    3)."""
 
     base: Float[Tensor, "vertices 3"]
     """The surface without its texture."""
     faces: Int[Tensor, "faces 3"]
     neighbours: Int[Tensor, "faces 3"]
-    """The face across each edge; at a border the face itself."""
+    """The face across each edge; the face itself at a border."""
     opposite: Int[Tensor, "faces 3"]
-    """The vertex across each edge; at a border the face's own third one."""
+    """The vertex across each edge; the face's own third vertex at a border."""
     frames: Float[Tensor, "faces corners xyz 3"]
-    """For each corner an orthonormal frame of the base: along its edge, across it, outward."""
+    """Orthonormal frame of the base at each corner: along its edge, across it, outward."""
     parents: Int[Tensor, "vertices 2"] | None
-    """Ends of the edge of the level below that a vertex halves, or twice the vertex that it was
-    there; None at the lowest level."""
+    """The two vertices of the level below whose edge a vertex splits, or the same vertex twice if
+    it existed there; None at the lowest level."""
 
 
 def pyramid(
@@ -43,8 +43,8 @@ def pyramid(
     project: Callable[[np.ndarray], np.ndarray],
     device: torch.device,
 ) -> list[Level]:
-    """A coarse mesh, each face divided into four again and again; ``project`` pulls the new
-    vertices onto the surface that the mesh stands for."""
+    """Subdivide a coarse mesh repeatedly, each face into four; ``project`` moves new vertices onto
+    the true surface."""
     import gpytoolbox
 
     built = [_level(vertices, faces, None, device)]
@@ -62,7 +62,7 @@ def pyramid(
 def upsample(
     level: Level, coarse: Float[Tensor, "coarse channels"]
 ) -> Float[Tensor, "fine channels"]:
-    """Values of the level below, at this one's vertices."""
+    """Interpolate values of the level below at this level's vertices."""
     assert level.parents is not None
     return coarse[level.parents].mean(1)
 
@@ -70,7 +70,8 @@ def upsample(
 def restrict(
     level: Level, fine: Float[Tensor, "fine channels"]
 ) -> Float[Tensor, "coarse channels"]:
-    """Values one level down: each vertex's own and half of each new neighbour's, averaged."""
+    """Restrict values to the level below: a weighted mean of each vertex and, with weight 1/2, its
+    new neighbours."""
     assert level.parents is not None
     count = int(level.parents.max()) + 1
     ends, ones = level.parents.reshape(-1), torch.ones_like(fine[:, :1])
@@ -89,7 +90,7 @@ def _level(
     along = np.roll(corners, -1, axis=1) - corners
     normal = np.cross(along[:, 0], along[:, 1])
     length = np.linalg.norm(normal, axis=1, keepdims=True)
-    # A face without area has no normal of its own: its vertices' serves.
+    # A zero-area face has no normal: use its vertices' normal.
     lost = vertex_normals(vertices, faces)[faces].mean(axis=1)
     normal = np.where(length > 1e-12, normal / np.maximum(length, 1e-12), lost)
     x = along - (along * normal[:, None]).sum(-1, keepdims=True) * normal[:, None]

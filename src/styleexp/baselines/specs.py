@@ -13,46 +13,46 @@ if TYPE_CHECKING:
 
 @dataclass
 class DisplacementMapConfig:
-    """A height map laid on the source by triplanar projection."""
+    """A height map applied to the source by triplanar projection."""
 
     name: str = "displacement_map"
     height: float | None = None
     """Half the range of the relief, in radii of the normalised source. null: that of the style
-    mesh's own relief, for a picture, which doesn't tell, 0.05, both at the pattern's size."""
+    mesh's own relief, or 0.05 for an image, both scaled with the pattern."""
     patch: float = 0.6
-    """Mesh styles: radius of the patch that the height map is taken from, in the style's radii."""
+    """Mesh styles: radius of the patch that the height map is taken from, in radii of the style."""
     sharpness: float = 8.0
-    """Power of the normal's components by which the three projections are blended."""
+    """Exponent of the normal's components in the blend of the three projections."""
 
 
 @dataclass
 class SynthesisConfig:
-    """The style's relief laid on by example, the default; see docs/synthesis.md."""
+    """Texture synthesis of the style's relief on the source (default); see docs/synthesis.md."""
 
     name: str = "synthesis"
     bank: int = 10_000
-    """Patches that are taken of the style at each scale."""
+    """Number of patches sampled from the style at each scale."""
     flatten: float = 0.0
-    """Share of the source's own relief, 0 to 1, that is taken off where it is as fine as the
-    pattern: for a source whose bumps hide it."""
+    """Fraction of the source's own relief to remove, 0 to 1, at scales as fine as the pattern: for
+    a source whose bumps hide the pattern."""
 
 
 @dataclass
 class GeometricTexturesConfig:
-    """A GAN on triangles, after Hertz et al. 2020. Sizes are for a CPU."""
+    """A GAN on triangles, after Hertz et al. 2020. Default sizes are for a CPU."""
 
     name: str = "geometric_textures"
     levels: int = 3
-    """Of subdivision; each has four times the faces of the one before."""
+    """Number of subdivision levels; each has four times the faces of the one before."""
     base: int = 1000
-    """Vertices of the exemplar at its lowest level. The source gets triangles of the same size, at
-    the size that ``style.scale`` gives the pattern."""
+    """Vertices of the exemplar at its lowest level. The source gets triangles of the same size
+    relative to the pattern, see ``style.scale``."""
     iterations: int = 20
-    """Updates of the generator in each of ``optim.steps`` steps."""
+    """Generator updates per step (``optim.steps``)."""
     critic_steps: int = 2
-    """Updates of the critic before each."""
+    """Critic updates per generator update."""
     patch: int = 1500
-    """Faces of the exemplar that one update looks at."""
+    """Faces of the exemplar per update."""
     width: int = 32
     """Channels of the networks."""
     depth: int = 4
@@ -77,11 +77,11 @@ def _synthesis(config: SynthesisConfig) -> Method:
     return Synthesis(config)
 
 
-# field.sigma tells how far source.refine=auto goes.
+# source.refine=auto depends on field.sigma.
 BASELINES: dict[str, Spec] = {
     "displacement_map": Spec(
         "displacement_map",
-        "a height map of the style laid on by triplanar projection: no learning, no steps",
+        "the style's height map, applied by triplanar projection: no learning, no steps",
         DisplacementMapConfig,
         _displacement_map,
         reads=("field.sigma",),
@@ -95,7 +95,7 @@ BASELINES: dict[str, Spec] = {
     ),
     "synthesis": Spec(
         "synthesis",
-        "the relief laid on by example, patch by patch (texture synthesis on the surface): seconds",
+        "the style's relief by texture synthesis on the surface, patch by patch: seconds",
         SynthesisConfig,
         _synthesis,
         reads=("field.sigma", "field.unfold"),

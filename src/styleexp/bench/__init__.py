@@ -1,1 +1,1 @@
-"""How fast it is, and where the time goes: ``styleexp-bench``. Results: docs/benchmarks.md."""
+"""Benchmarks and profiles: ``styleexp-bench``. Results: docs/benchmarks.md."""

@@ -1,8 +1,8 @@
-"""How near to the style a method is after how many seconds.
+"""Style distance over time, for several methods.
 
-Training losses of two methods can't be compared, so the mesh that each would end with is measured
-by the metric that judges finished runs. The clock stands still meanwhile. Seconds are those of a
-run's steps with everything before them: meshes and encoder loaded, targets measured.
+Training losses of different methods can't be compared, so each method's current result is measured
+with the metric for finished runs, with the clock stopped. Seconds include everything before the
+first step: loading meshes and encoder, and measuring targets.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ Point = dict[str, float]
 
 
 def measure(overrides: Sequence[str], methods: Sequence[str], points: int, out: Path) -> dict:
-    """Run every method with these overrides; draw ``out`` and write its numbers beside it."""
+    """Run every method with these overrides; draw ``out`` and write its numbers next to it."""
     import torch
 
     from styleexp.bench.measuring import machine
     from styleexp.compose import compose
 
     if not out.parent.is_dir():
-        raise UserError(f"there is no folder '{out.parent}' to write '{out.name}' in.")
+        raise UserError(f"cannot write '{out.name}': there is no folder '{out.parent}'.")
     if any(each.startswith("method=") for each in overrides):
         raise UserError("name the methods with --methods, not with method=.")
     if len(set(methods)) < len(methods):
@@ -47,7 +47,8 @@ def measure(overrides: Sequence[str], methods: Sequence[str], points: int, out: 
 
 
 def run(config: Config, points: int) -> list[Point]:
-    """One run, measured at ``points`` steps spread over it, denser at its beginning, and before."""
+    """Run once and measure before the first step and at ``points`` steps, denser at the
+    beginning."""
     from styleexp import baselines, metrics
 
     name = metrics.judge_name(config.metrics.judge, config.encoder.name)
@@ -87,12 +88,14 @@ def run(config: Config, points: int) -> list[Point]:
 
 
 def redraw(numbers: Path, out: Path) -> dict[str, Any]:
-    """Draw again what was measured before."""
+    """Redraw an earlier measurement."""
     try:
         found = json.loads(numbers.read_text(encoding="utf-8"))
         return found | _drawn(found, out)
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"'{numbers}' can't be drawn ({error}): give what --out wrote.") from error
+        raise UserError(
+            f"'{numbers}' can't be drawn ({error}): give the JSON file that --out wrote."
+        ) from error
 
 
 def _drawn(found: dict[str, Any], out: Path) -> dict[str, str]:

@@ -1,8 +1,8 @@
-"""The least time that the encoder's convolutions can take here, measured in the same process.
+"""Lower bounds on the time of the encoder's convolutions, measured in the same process.
 
-Two floors. ``floor``: their multiplications at the best rate that any product or convolution tried
-here reaches; nothing but arithmetic. ``convolutions``: each convolution alone, forward and gradient
-of its input, with nothing else in the caches; what is left above it are ReLU, pooling, copies.
+Two bounds. ``floor``: their arithmetic at the best rate that any matrix product or convolution
+reaches on this machine. ``convolutions``: each convolution alone, forward and input gradient, with
+warm caches; the remaining time is ReLU, pooling and copies.
 """
 
 from __future__ import annotations
@@ -20,34 +20,35 @@ if TYPE_CHECKING:
     from styleexp.encoders.vgg import Encoder
 
 Shape = tuple[int, int, int, int, int]
-"""Images, channels in, channels out, height, width of a 3x3 convolution that keeps the size."""
+"""Images, input channels, output channels, height and width of a size-preserving 3x3
+convolution."""
 Call = tuple[tuple[int, ...], tuple[str, ...], bool]
-"""Of an encoder: shape of the images, layers, whether gradients are taken."""
+"""An encoder call: shape of the images, layers, whether gradients are computed."""
 Key = tuple[Shape, bool] | None
-"""A convolution and whether its gradient is meant, or (None) the matrix product."""
+"""A convolution and whether to time its gradient, or None for the matrix product."""
 PRODUCT = 2048
-"""Rows and columns of the matrix product that is tried."""
+"""Rows and columns of the timed matrix product."""
 
 
 @dataclass(frozen=True)
 class Floor:
-    """All in CPU seconds a step, but for the rates."""
+    """Bounds in CPU seconds per step, and rates."""
 
     flops: float
-    """Floating-point operations of the convolutions, forward and, where taken, backward."""
+    """Floating-point operations of the convolutions, forward and, if computed, backward."""
     rates: dict[str, float]
-    """Operations a CPU second: of the matrix product, and of the best convolution."""
+    """Operations per CPU second of the matrix product, and of the best convolution."""
     convolutions: float
-    """Each convolution alone, added up."""
+    """Sum over the convolutions, each timed alone."""
 
     @property
     def seconds(self) -> float:
-        """The operations at the best rate."""
+        """Time of all operations at the best rate."""
         return self.flops / max(self.rates.values())
 
 
 def encoder_floor(encoder: Encoder, calls: Iterable[Call], repeats: int = 3) -> Floor:
-    """The floor of a step in which the encoder is called like that."""
+    """Lower bounds of a step that makes these encoder calls."""
     forward: Counter[Shape] = Counter()
     backward: Counter[Shape] = Counter()
     for images, layers, gradients in calls:
@@ -63,7 +64,7 @@ def encoder_floor(encoder: Encoder, calls: Iterable[Call], repeats: int = 3) -> 
             work[shape, True] = back
     square = torch.randn(PRODUCT, PRODUCT, device=weight.device).to(weight.dtype)
     work[None] = lambda: square @ square
-    # The least time, not the median: what is looked for is what the machine can do.
+    # The minimum, not the median: the best the machine can do.
     best = {key: min(times.cpu) for key, times in interleaved(work, repeats).items()}
     counts: dict[tuple[Shape, bool], int] = {(shape, False): n for shape, n in forward.items()}
     counts |= {(shape, True): n for shape, n in backward.items() if n}
@@ -90,7 +91,7 @@ def convolutions(encoder: Encoder, images: tuple[int, ...], layers: Iterable[str
 
 
 def operations(shape: Shape) -> float:
-    """Two for each multiplication and addition."""
+    """Floating-point operations: two per multiply-add."""
     images, into, out, height, width = shape
     return 2.0 * 9 * images * into * out * height * width
 

@@ -1,8 +1,8 @@
-"""Clocks, peak memory, and the machine that was measured on.
+"""Clocks, peak memory, and a description of the machine.
 
-Two times are taken of everything. Wall time is what a user feels; on a machine that others use, it
-measures them as well. CPU time is the process's own: with one thread it changes less when the
-machine is busy. Numbers of one process, taken in turns, make a ratio that holds on either.
+Everything is timed twice. Wall time is what users experience, but includes other processes on a
+shared machine. CPU time is the process's own: with one thread it varies less on a busy machine.
+Ratios of interleaved measurements in one process are reliable on either.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 @dataclass(frozen=True)
 class Times:
-    """Seconds of each repeat."""
+    """Wall and CPU seconds of each repeat."""
 
     wall: list[float]
     cpu: list[float]
@@ -35,12 +35,12 @@ class Times:
 
     @property
     def cpu_ms(self) -> float:
-        """Median of the CPU times of all threads together, in milliseconds."""
+        """Median of the CPU times, summed over threads, in milliseconds."""
         return 1e3 * median(self.cpu)
 
 
 def interleaved(contenders: Mapping[K, Callable[[], object]], repeats: int) -> dict[K, Times]:
-    """Run the contenders in turns, ``repeats`` times each, after once for nothing."""
+    """Run the contenders in turns, ``repeats`` times each, after one warm-up."""
     for run in contenders.values():
         run()
     times: dict[K, Times] = {name: Times([], []) for name in contenders}
@@ -54,14 +54,14 @@ def interleaved(contenders: Mapping[K, Callable[[], object]], repeats: int) -> d
 
 
 def ratio(slower: list[float], faster: list[float]) -> float:
-    """Median of the ratios of the repeats, which ran side by side."""
+    """Median of the ratios of interleaved repeats."""
     return median(a / b for a, b in zip(slower, faster, strict=True))
 
 
 def peak_memory_mb(run: Callable[[], object]) -> float:
-    """Most memory that the process holds during ``run``, in MB, with all that it held before.
+    """Peak memory of the process during ``run``, in MB, including earlier allocations.
 
-    Where the system can't start counting anew (all but Linux), the peak since the process began.
+    Where the counter can't be reset (anywhere but Linux), the peak since the process started.
     """
     anew = os.access(CLEAR, os.W_OK)
     if anew:
@@ -75,7 +75,7 @@ def peak_memory_mb(run: Callable[[], object]) -> float:
 
 
 def machine() -> dict[str, Any]:
-    """What a reader needs to know to compare numbers with ours."""
+    """Description of the machine, for comparing numbers."""
     import torch
 
     gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]

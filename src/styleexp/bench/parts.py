@@ -1,8 +1,8 @@
-"""Where the time of a step goes, by part, forward and backward, in the real loop.
+"""Time of a step by part, forward and backward, in the real loop.
 
-A part is a function whose calls are timed. What it takes and gives passes through a mark, which
-tells the clock when a gradient comes by: from a part's outputs on, the backward pass is in that
-part, until it leaves by its inputs. Every moment counts for one part, so they sum to the whole.
+A part is a function whose calls are timed. Its inputs and outputs pass through a marker that
+notifies the clock when a gradient passes: the backward pass enters a part at its outputs and leaves
+it at its inputs. Every moment counts for exactly one part, so they sum to the total.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ BACKWARD = " backward"
 
 
 class Parts:
-    """Adds up wall and CPU seconds of the part that is being worked in."""
+    """Accumulates wall and CPU seconds of the active part."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
         self.begin()
 
     def begin(self) -> None:
-        """Start from nothing."""
+        """Reset and start."""
         self.spent: dict[str, list[float]] = defaultdict(lambda: [0.0, 0.0])
         self.within = [OTHER]
         self.last = self._now()
@@ -44,17 +44,17 @@ class Parts:
         return {name: (wall, cpu) for name, (wall, cpu) in self.spent.items()}
 
     def turn(self, name: str) -> None:
-        """From now on the work is in ``name``, at the depth of calls that we are in."""
+        """Make ``name`` the active part, at the current call depth."""
         self._count()
         self.within[-1] = name
 
     def timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """The function as a part."""
+        """Wrap a function as a part."""
 
         @wraps(function)
         def run(*given: Any, **named: Any) -> Any:
             if len(self.within) == 1 and torch.is_grad_enabled():
-                self.turn(OTHER)  # the backward pass, which takes no gradients itself, is over
+                self.turn(OTHER)  # the backward pass has ended
             around = self.within[-1]
             self._count()
             self.within.append(name)
@@ -70,7 +70,7 @@ class Parts:
         return run
 
     def wrap(self, name: str, owner: Any, attribute: str) -> None:
-        """Make a method or a submodule of an object a part, for as long as the object lives."""
+        """Wrap a method or submodule of an object as a part, permanently."""
         found = getattr(owner, attribute)
         if isinstance(found, nn.Module):
             owner, attribute, found = found, "forward", found.forward
@@ -90,7 +90,7 @@ class Parts:
 
 
 class _Mark(torch.autograd.Function):
-    """Its input; tells when the gradient comes by."""
+    """Identity that notifies when the gradient passes."""
 
     @staticmethod
     def forward(ctx: Any, value: Tensor, tell: Callable[[], None]) -> Tensor:
@@ -104,7 +104,7 @@ class _Mark(torch.autograd.Function):
 
 
 def _marked(value: Any, tell: Callable[[], None]) -> Any:
-    """The same with a mark on each tensor that carries a gradient."""
+    """Copy of a value with a marker on each tensor that carries a gradient."""
     if isinstance(value, Tensor):
         marks = torch.is_grad_enabled() and value.requires_grad
         return _Mark.apply(value, tell) if marks else value
@@ -122,9 +122,9 @@ def _marked(value: Any, tell: Callable[[], None]) -> Any:
 
 @contextmanager
 def timed_stages(clock: Parts, stages: Sequence[tuple[str, Any, str]]) -> Iterator[None]:
-    """Make functions, or the autograd functions, of modules or classes parts, for the moment.
+    """Temporarily wrap functions or autograd functions of modules or classes as parts.
 
-    Each stage is the part's name, the module or class, and the name there.
+    Each stage is the part's name, the module or class, and the attribute's name.
     """
     before = [(owner, name, getattr(owner, name)) for _, owner, name in stages]
     try:
@@ -146,7 +146,7 @@ GRAMS = [
     ("Gram matrices", fused, "gram"),
     (f"Gram matrices{BACKWARD}", fused, "add_gram_gradient"),
 ]
-"""Within the encoder's own step."""
+"""Stages of the encoder's fused Gram computation."""
 STAGES = [
     *NORMALS,
     ("projection", deferred, "Project"),
@@ -159,4 +159,4 @@ STAGES = [
     ("outlines", deferred, "CrossingDistance"),
     ("outlines", deferred, "Compose"),
 ]
-"""Of ``soft_raster``, which shades and anti-aliases only what is visible."""
+"""Stages of ``soft_raster``, which shades and anti-aliases only visible pixels."""

@@ -1,7 +1,7 @@
-"""Other renderers, given the same task. Imported only when they are asked for.
+"""Third-party renderers on the same task. Imported on demand.
 
-Each does what its own examples do: one light, smooth normals, anti-aliased outlines that carry
-gradients, all views after each other where it has no batches.
+Each is used as in its own examples: one light, smooth normals, anti-aliased outlines with
+gradients. Views are rendered one by one if it doesn't support batches.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ def _need(name: str) -> None:
 
 
 def deodr(task: Task) -> Contender:
-    """DEODR (BSD): C++ on the CPU, float64, a view at a time."""
+    """DEODR (BSD): C++ on the CPU, float64, one view at a time."""
     _need("deodr")
-    with warnings.catch_warnings(action="ignore"):  # of its own docstrings
+    with warnings.catch_warnings(action="ignore"):  # about its own docstrings
         from deodr.differentiable_renderer import Camera, Scene3D
         from deodr.triangulated_mesh import ColoredTriMesh
 
@@ -71,10 +71,10 @@ def deodr(task: Task) -> Contender:
 
 
 def _nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """DEODR refuses what float32 leaves of a rotation."""
+    """Nearest exact rotation; DEODR rejects rotations with float32 rounding."""
     u, _, v = np.linalg.svd(matrix)
     return u @ v
 
 
 PEERS = {"deodr": deodr}
-"""Renderers of others. Our own backends are peers of each other by their names."""
+"""Third-party renderers. Built-in backends can be compared too, by name."""

@@ -1,4 +1,5 @@
-"""A render and its gradient, by our renderers and by others', in turns in one process."""
+"""Benchmark a render and its gradient, for built-in and third-party renderers, interleaved in one
+process."""
 
 from __future__ import annotations
 
@@ -25,15 +26,16 @@ if TYPE_CHECKING:
     from styleexp.renderers.base import Cameras, Renderer
 
 DISTANCE, FOV = 2.2, 60.0
-"""Of the cameras, in radii and degrees: the unit sphere fills most of the frame."""
+"""Camera distance in radii and field of view in degrees: the unit sphere fills most of the
+frame."""
 
 LIGHT = (0.0, 0.0, 0.7)
-"""From the camera: where light falls at a grazing angle, renderers cut it off differently."""
+"""Light from the camera, because renderers clamp grazing light differently."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """What is rendered: every contender gets the same. On the CPU; in the unit sphere."""
+    """The scene, the same for every contender. On the CPU; in the unit sphere."""
 
     vertices: Float[Tensor, "vertices 3"]
     faces: Int[Tensor, "faces 3"]
@@ -41,12 +43,12 @@ class Task:
     shading: Shading
     resolution: int
     weights: Float[Tensor, "views height width"]
-    """The gradient of the loss by the image."""
+    """Gradient of the loss w.r.t. the image."""
 
 
 @dataclass(frozen=True)
 class Rendered:
-    """What a contender gives back, to see that it did the same work."""
+    """A contender's output, to check that it did the same work."""
 
     image: Float[np.ndarray, "views height width"]
     gradient: Float[np.ndarray, "vertices 3"]
@@ -56,14 +58,13 @@ Contender = Callable[[], Rendered]
 
 
 def make_task(name: str, faces: int, views: int, resolution: int) -> Task:
-    """The mesh of an analytic style, seen from all around, smoothly shaded."""
+    """Make a task from an analytic style's mesh, viewed from all around, smoothly shaded."""
     mesh = shapes.make(name, faces // 2 + 2)
     points = meshes.normalisation(mesh.vertices).apply(mesh.vertices)
     generator = torch.Generator().manual_seed(0)
     elevation = (torch.rand(views, generator=generator) - 0.5) * math.pi / 2
     azimuth = torch.arange(views) * (2 * math.pi / views)
-    # A smooth gradient, as an encoder's is; of noise, only what a renderer does within a pixel
-    # would tell.
+    # A smooth gradient, like an encoder's; noise would only measure sub-pixel behaviour.
     coarse = torch.randn(views, 1, 8, 8, generator=generator)
     size = (resolution, resolution)
     weights = torch.nn.functional.interpolate(coarse, size, mode="bicubic")[:, 0]
@@ -78,7 +79,7 @@ def make_task(name: str, faces: int, views: int, resolution: int) -> Task:
 
 
 def ours(task: Task, name: str, device: torch.device) -> Contender:
-    """One of our backends, forward and backward."""
+    """A built-in backend, forward and backward."""
     renderer: Renderer = build("renderer", find("renderer", name).spec.config(name=name))
     if device.type not in renderer.capabilities.devices:
         device = torch.device("cpu")
@@ -98,7 +99,7 @@ def ours(task: Task, name: str, device: torch.device) -> Contender:
 
 
 def measure(task: Task, names: Sequence[str], device: torch.device, repeats: int) -> dict[str, Any]:
-    """Time ``names``, the first being the one that the others are compared with."""
+    """Time ``names`` and compare the others with the first."""
     contenders = {
         name: peers.PEERS[name](task) if name in peers.PEERS else ours(task, name, device)
         for name in names
@@ -143,7 +144,7 @@ def sweep(
     devices: Sequence[torch.device],
     repeats: int,
 ) -> Iterator[dict[str, Any]]:
-    """A row for each (faces, views, resolution) and device."""
+    """Benchmark every combination; one row per (faces, views, resolution) and device."""
     task, made = None, None
     for faces, views, resolution in sizes:
         if made != (faces, views, resolution):
@@ -154,7 +155,7 @@ def sweep(
 
 
 def parts(task: Task, device: torch.device, repeats: int) -> dict[str, float]:
-    """CPU milliseconds of a render's parts; medians, which needn't sum exactly to the whole's."""
+    """CPU milliseconds of a render's parts: medians, which needn't sum exactly to the total."""
     clock = Parts(device)
     run = ours(task, "soft_raster", device)
     rows = []

@@ -1,4 +1,4 @@
-"""Where a step of an optimisation spends its time, by part, and how far that is from the least."""
+"""Time of an optimisation step by part, and its distance from the lower bound."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ FORWARD = (
     "logging",
 )
 PARTS = tuple(name + end for name in FORWARD for end in ("", BACKWARD))
-"""In the order of a step; those without a backward pass never show one."""
+"""Parts in the order of a step. Those without a backward pass are omitted from the output."""
 
 
 class _Timed:
-    """Something callable as a part, with all that it has."""
+    """Proxy that times a callable as a part and forwards its attributes."""
 
     def __init__(self, clock: Parts, name: str, inner: Any) -> None:
         self._inner, self._call = inner, clock.timed(name, inner)
@@ -53,8 +53,8 @@ class _Timed:
 def measure(
     overrides: Sequence[str], steps: int, watch: Callable[[Any], object] = lambda step: None
 ) -> dict[str, Any]:
-    """Take ``steps`` steps after two for nothing, with the overrides of ``styleexp``; ``watch`` is
-    shown each."""
+    """Time ``steps`` steps after two warm-up steps, with overrides as for ``styleexp``; ``watch``
+    is called with each."""
     config = compose(overrides)
     if config.threads:
         torch.set_num_threads(config.threads)
@@ -62,9 +62,7 @@ def measure(
     scene = method.prepare(config)
     state = method.start(scene)
     if state is None or not isinstance(scene, Scene):
-        raise UserError(
-            "this method has no steps of the style loss: choose method=robust or paper."
-        )
+        raise UserError("this method doesn't optimise a style loss: choose method=robust or paper.")
     config.optim.steps = max(config.optim.steps, steps + 2)
     device = scene.surface.vertices.device
 
@@ -108,14 +106,14 @@ def measure(
 
 
 def _log(folder: RunFolder, step: Any, state: Any, config: Any) -> None:
-    """What a run writes."""
+    """Log a step as a run does."""
     folder.append_metrics(step)
     if state.step % config.optim.checkpoint_every == 0:
         folder.save_checkpoint(state)
 
 
 def _note_calls(encoder: Any) -> list[Call]:
-    """A list that each call of the encoder is added to."""
+    """Record each encoder call in the returned list."""
     calls: list[Call] = []
 
     def note(images: torch.Tensor, layers: Iterable[str]) -> None:

@@ -1,4 +1,4 @@
-"""How a command with subcommands ends: its answer as text or JSON, or what the user can mend."""
+"""Output of commands with subcommands: text, JSON, or a user error."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from styleexp.errors import UserError
 
 
 def answer(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
-    """Print what ``options.function`` finds, by ``options.show`` or as JSON; return 0, or 2 after
-    printing a `UserError`."""
+    """Print the result of ``options.function``, with ``options.show`` or as JSON. Return 0, or 2
+    after printing a `UserError`."""
     try:
         found = options.function(options)
     except UserError as error:

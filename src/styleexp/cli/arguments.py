@@ -1,4 +1,4 @@
-"""The words of the ``styleexp`` command, in the order and the grammar that Hydra wants."""
+"""Convert the arguments of ``styleexp`` to Hydra's order and grammar."""
 
 from __future__ import annotations
 
@@ -10,17 +10,16 @@ from styleexp.errors import UserError, unknown_name
 
 MULTIRUN = ("-m", "--multirun")
 SWEPT = ("+experiment=", "experiment=", "+search=", "search=", "hydra.mode=MULTIRUN")
-"""Overrides that make a sweep without ``-m``."""
+"""Overrides that imply a sweep without ``-m``."""
 REFUSED = {
-    "--experimental-rerun": "runs what a pickle holds: go on with a run by resume=FOLDER",
+    "--experimental-rerun": "executes a pickle: continue a run with resume=FOLDER",
 }
 
 
 def for_hydra(given: Sequence[str]) -> list[str]:
-    """Flags first, then all else as overrides; words after ``--`` are no flags.
+    """Put flags first, then overrides; words after ``--`` are never flags.
 
-    Raises `UserError` for a flag that Hydra doesn't know, and for what `overrides.understood` can't
-    make sense of.
+    Raises `UserError` for a flag unknown to Hydra, and the errors of `overrides.understood`.
     """
     flags, words = _parted(given)
     multirun = any(f in MULTIRUN for f in flags) or any(w.startswith(SWEPT) for w in words)
@@ -46,7 +45,7 @@ def _parted(given: Sequence[str]) -> tuple[list[str], list[str]]:
             if name not in actions:
                 raise unknown_name("flag", name, actions)
             if name in REFUSED:
-                raise UserError(f"{name} is not supported, since it {REFUSED[name]}.")
+                raise UserError(f"{name} is not supported, because it {REFUSED[name]}.")
             flags.append(word)
             action = actions[name]
             if not equals and action.nargs is None and _takes_a_value(action):

@@ -1,4 +1,4 @@
-"""``styleexp-assets``: which meshes, images and weights there are, where, and whose they are."""
+"""``styleexp-assets``: list, locate and fetch meshes, images and weights."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from styleexp.errors import UserError, unknown_name
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 0, or 2 after printing what the user can mend."""
+    """Run the command; return 0, or 2 after printing a user error."""
     options = _parser().parse_args(arguments)
     try:
         if options.command == "list":
@@ -30,19 +30,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="styleexp-assets",
-        description="Named meshes, images and weights: where they are, whose they are, how to get "
-        "them. Folders to search: STYLEEXP_ASSETS; cache: STYLEEXP_CACHE.",
+        description="Named meshes, images and weights: locations, licences and downloads. Search "
+        "path: STYLEEXP_ASSETS; cache: STYLEEXP_CACHE.",
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, text in (
-        ("list", "what can be used by name, and whether it is on this machine"),
-        ("fetch", "make sure that assets are here; download and convert weights"),
-        ("where", "the files behind names that are already here; downloads nothing"),
+        ("list", "list all names, and whether they are on this machine"),
+        ("fetch", "make sure that assets are on this machine; download and convert weights"),
+        ("where", "print the files of names that are on this machine; downloads nothing"),
     ):
         command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         command.add_argument("--kind", choices=assets.KINDS, help="only this kind")
         if name == "list":
-            command.add_argument("--json", action="store_true", help="everything, as JSON")
+            command.add_argument("--json", action="store_true", help="print everything as JSON")
         else:
             command.add_argument("names", nargs="+", metavar="NAME")
     return parser
@@ -66,7 +66,7 @@ def _list(kind: str | None, as_json: bool) -> None:
     table = [header]
     for row in rows:
         here = "yes" if row["path"] else "no"
-        licence, author = row["licence"] or "not known", row["author"] or "a file of yours"
+        licence, author = row["licence"] or "unknown", row["author"] or "your file"
         table.append((str(row["name"]), str(row["kind"]), here, licence, author))
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     for line in table:
@@ -78,9 +78,9 @@ def _where(name: str, kind: str) -> str:
     if path is None:
         if name not in assets.names(kind):
             raise unknown_name(kind, name, assets.names(kind))
-        how = f"'styleexp-assets fetch {name}' gets it"
+        how = f"'styleexp-assets fetch {name}' downloads it"
         if kind != "weights":
-            how = "name a folder that holds it in STYLEEXP_ASSETS"
+            how = "add its folder to STYLEEXP_ASSETS"
         raise UserError(f"the {kind} '{name}' is not on this machine: {how}.")
     return str(path)
 

@@ -1,4 +1,4 @@
-"""``styleexp-bake``: a run's displacement as textures of its source."""
+"""``styleexp-bake``: bake a run's displacement into textures of its source."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from styleexp import atomic
 from styleexp.errors import UserError
 
 DESCRIPTION = """\
-Bake the displacement of a finished run to the texture coordinates of its source: a height map and a
-tangent-space normal map (OpenGL, green is up), for the source mesh as it was. bake.json says how to
-read the height."""
+Bake the displacement of a finished run into a height map and a tangent-space normal map (OpenGL,
+green is up), using the texture coordinates of the unchanged source mesh. bake.json describes the
+encoding of the height."""
 FORMATS = ("png", "exr")
 SIZES = (16, 16384)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 0, or 2 after printing what the user can mend."""
+    """Run the command; return 0, or 2 after printing a user error."""
     options = _parser().parse_args(arguments)
     try:
         for path in bake(options.folder, options.size, options.format, options.out):
@@ -36,9 +36,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def bake(folder: Path, size: int, kind: str, out: Path | None = None) -> list[Path]:
-    """Bake a run's folder, into ``out`` or its ``bake``; returns the files' paths."""
+    """Bake a run's folder, into ``out`` or its subfolder ``bake``; return the files' paths."""
     if not folder.is_dir():
-        raise UserError(f"there is no folder '{folder}': give a run's.")
+        raise UserError(f"there is no folder '{folder}': give a run's folder.")
     if not SIZES[0] <= size <= SIZES[1]:
         raise UserError(f"--size {size} is not allowed: give {SIZES[0]} to {SIZES[1]} pixels.")
     if kind == "exr":
@@ -46,7 +46,7 @@ def bake(folder: Path, size: int, kind: str, out: Path | None = None) -> list[Pa
 
         if find_spec("OpenEXR") is None:
             raise UserError(
-                "--format exr needs OpenEXR: pip install 'styleexp[exr]', or take --format png."
+                "--format exr needs OpenEXR: pip install 'styleexp[exr]', or use --format png."
             )
     from styleexp import bake as baking
     from styleexp.reports import shown
@@ -55,15 +55,15 @@ def bake(folder: Path, size: int, kind: str, out: Path | None = None) -> list[Pa
     maps = baking.bake(source, displacement, vertices, size)
     if maps.overlap > 0.01:
         print(
-            f"styleexp-bake: warning: {maps.overlap:.0%} of the texture lies under several faces "
-            "(mirrored, stacked or tiled islands), which can't each have a relief of their own: "
-            "the last face's is kept. Unwrap without overlaps for all of them.",
+            f"styleexp-bake: warning: {maps.overlap:.0%} of the texture is shared by several "
+            "faces (mirrored, stacked or tiled islands) and keeps only the last face's relief. "
+            "Unwrap without overlaps to keep all.",
             file=sys.stderr,
         )
     if source.carrier is not None and source.carrier.flipped.any():
         print(
-            "styleexp-bake: warning: faces of the source's file point inwards; the maps are for "
-            "normals that point outwards (in Blender: Mesh > Normals > Recalculate Outside).",
+            "styleexp-bake: warning: faces of the source's file point inwards, but the maps "
+            "assume outward normals (in Blender: Mesh > Normals > Recalculate Outside).",
             file=sys.stderr,
         )
     target = out or folder / "bake"
@@ -75,13 +75,14 @@ def bake(folder: Path, size: int, kind: str, out: Path | None = None) -> list[Pa
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="styleexp-bake", description=DESCRIPTION)
-    parser.add_argument("folder", type=Path, metavar="RUN_FOLDER", help="of a finished run")
-    parser.add_argument("--size", type=int, default=2048, help="pixels on a side (2048)")
+    parser.add_argument("folder", type=Path, metavar="RUN_FOLDER", help="folder of a finished run")
+    parser.add_argument("--size", type=int, default=2048, help="side in pixels (default: 2048)")
     parser.add_argument(
         "--format",
         choices=FORMATS,
         default="png",
-        help="png: 16 bits a channel; exr: floats, the displacement itself (extra exr)",
+        help="png: 16 bits per channel; exr: 32-bit floats, unscaled displacement (needs the "
+        "extra exr)",
     )
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="RUN_FOLDER/bake")
     return parser

@@ -1,4 +1,4 @@
-"""``styleexp-bench``: how fast it is, and where the time goes."""
+"""``styleexp-bench``: benchmarks and profiles."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FACES = "5000, 20000, 80000, 320000, 1280000"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 0, or 2 after printing what the user can mend."""
+    """Run the command; return 0, or 2 after printing a user error."""
     parser = _parser()
     return answer(parser, parser.parse_args(arguments))
 
@@ -24,38 +24,41 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="styleexp-bench",
-        description="How fast it is, and where the time goes. Times are medians. CPU times are the "
-        "process's own: with one thread they hold on a busy machine, too. docs/benchmarks.md has "
-        "what came out.",
+        description="Benchmarks and profiles. Times are medians. CPU times are the process's "
+        "own; with one thread they are valid even on a busy machine. Results: docs/benchmarks.md.",
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     render = commands.add_parser(
         "render",
-        help="a render and its gradient, against other renderers",
-        description="Forward and backward, outlines' gradients included, in turns with the peers. "
-        "Several values, separated by commas, give a row for each combination.",
+        help="time a render and its gradient, against other renderers",
+        description="Forward and backward, including gradients of outlines, interleaved with the "
+        "peers. Comma-separated values give one row per combination.",
     )
-    render.add_argument("--faces", type=_numbers, default=[20_000], help=f"such as {FACES}")
+    render.add_argument(
+        "--faces", type=_numbers, default=[20_000], help=f"number of faces, e.g. {FACES}"
+    )
     render.add_argument("--views", type=_numbers, default=[5])
-    render.add_argument("--resolution", type=_numbers, default=[250], help="pixels on a side")
+    render.add_argument(
+        "--resolution", type=_numbers, default=[250], help="side of the image in pixels"
+    )
     render.add_argument("--renderer", default="soft_raster", help="ours (soft_raster)")
     render.add_argument(
         "--peer",
         action="append",
         default=[],
         metavar="NAME",
-        help="deodr, or another renderer of ours by its name; may be repeated",
+        help="deodr, or the name of another built-in renderer; repeatable",
     )
-    render.add_argument("--mesh", default="bubble", help="an analytic shape (bubble)")
+    render.add_argument("--mesh", default="bubble", help="analytic shape (default: bubble)")
     render.add_argument("--repeats", type=int, default=7)
-    render.add_argument("--threads", type=int, default=1, help="CPU threads of torch (1)")
-    render.add_argument("--device", default="cpu", help="cpu, cuda, or both, separated by a comma")
+    render.add_argument("--threads", type=int, default=1, help="CPU threads of torch (default: 1)")
+    render.add_argument("--device", default="cpu", help="cpu, cuda, or both (cpu,cuda)")
     render.set_defaults(function=_render, show=_show_rows)
 
     step = commands.add_parser(
         "step",
-        help="the parts of a step of an optimisation",
+        help="profile an optimisation step by part",
         description="Takes the overrides of styleexp: styleexp-bench step method=robust "
         "source=critter style=bubble profile=full threads=1.",
     )
@@ -65,21 +68,28 @@ def _parser() -> argparse.ArgumentParser:
 
     convergence = commands.add_parser(
         "convergence",
-        help="style distance against seconds, for several methods",
-        description="Runs each method, stops its clock at points spread over the run, and measures "
-        "the mesh that it would end with there.",
+        help="plot style distance over time, for several methods",
+        description="Runs each method, stops the clock at points spread over the run, and "
+        "measures the intermediate result.",
     )
     convergence.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="as for styleexp")
     convergence.add_argument("--methods", default="paper,robust", help="paper,robust")
-    convergence.add_argument("--points", type=int, default=8, help="measurements of each run (8)")
-    convergence.add_argument("--out", type=Path, help="PNG to draw; its numbers go beside it")
     convergence.add_argument(
-        "--redraw", type=Path, metavar="JSON", help="draw what was measured before, run nothing"
+        "--points", type=int, default=8, help="measurements per run (default: 8)"
+    )
+    convergence.add_argument(
+        "--out", type=Path, help="PNG to draw; its numbers are written next to it"
+    )
+    convergence.add_argument(
+        "--redraw",
+        type=Path,
+        metavar="JSON",
+        help="redraw an earlier measurement without running anything",
     )
     convergence.set_defaults(function=_convergence, show=_show_convergence)
 
     for command in (render, step, convergence):
-        command.add_argument("--json", action="store_true", help="everything, as JSON")
+        command.add_argument("--json", action="store_true", help="print everything as JSON")
     return parser
 
 
@@ -145,7 +155,7 @@ def _convergence(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _checked(overrides: list[str]) -> list[str]:
-    """The overrides, if Hydra takes them; what it says otherwise in one sentence."""
+    """Return the overrides if Hydra accepts them; else raise its error as one sentence."""
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 

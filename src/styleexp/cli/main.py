@@ -1,4 +1,4 @@
-"""``styleexp``: compose the configuration, run, and say in one sentence what went wrong."""
+"""``styleexp``: compose the configuration, run, and report errors in one sentence."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ usage: styleexp SOURCE STYLE [KEY=VALUE ...]
 
 Put the local geometry of STYLE, a mesh or a picture, onto the mesh SOURCE. Both are files or names.
 
-  styleexp critter bubble                 analytic shapes, always there
+  styleexp critter bubble                 analytic shapes, always available
   styleexp my.obj her.ply                 files
-  styleexp my.obj bark.jpg strength=0.5   a picture as style, half as high
+  styleexp my.obj bark.jpg strength=0.5   a picture as style, at half the height
   styleexp my.obj her.ply method=robust   learned from renders, as in the paper: slower
-  styleexp resume=FOLDER                  go on with a run that was stopped
+  styleexp resume=FOLDER                  continue a stopped run
 
-styleexp --help lists all keys and choices, styleexp-assets list the names.
+styleexp --help lists all keys and choices, and styleexp-assets list all names.
 """
 
 
@@ -35,7 +35,7 @@ def main() -> None:
 
     warnings.showwarning = _show_warning  # type: ignore[assignment]
     for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):  # names of files go anywhere, also to an ASCII terminal
+        if hasattr(stream, "reconfigure"):  # print any file name, even to an ASCII terminal
             stream.reconfigure(errors="backslashreplace")
     try:
         _command(sys.argv[1:])
@@ -55,9 +55,7 @@ def _command(given: list[str]) -> None:
     try:
         os.getcwd()
     except FileNotFoundError:
-        raise UserError(
-            "the folder that this command was started in no longer exists: change to another."
-        ) from None
+        raise UserError("the current folder no longer exists: change to another.") from None
     if not given:
         print(USAGE, end="", file=sys.stderr)
         sys.exit(2)
@@ -68,13 +66,13 @@ def _command(given: list[str]) -> None:
         return
     resume = [a for a in given if a.startswith("resume=")]
     if len(resume) > 1:
-        raise UserError("resume= goes on with one run: give it once.")
+        raise UserError("resume= continues a single run: give it once.")
     if resume:
         _resume(resume[0].removeprefix("resume="), [a for a in given if a not in resume])
     else:
         from styleexp.cli import arguments
 
-        # Hydra's parser refuses overrides on both sides of a flag: `+experiment=x -m profile=fast`.
+        # Hydra's parser rejects overrides on both sides of a flag: `+experiment=x -m profile=fast`.
         sys.argv[1:] = arguments.for_hydra(given)
         _hydra()
 
@@ -121,10 +119,11 @@ def _hydra() -> None:
 
 
 def _job(config: DictConfig) -> float | None:
-    """What Hydra calls for every job, maybe in another process.
+    """Job function for Hydra, possibly called in another process.
 
-    A job of a sweep never raises for its own failure, so that the others go on; its folder tells.
-    Those of a search do, as it counts them, and return what it minimises.
+    A sweep's job never raises when it fails, so that the others continue; its folder records the
+    failure. A search's job does raise, because the search counts failures, and returns the
+    objective.
     """
     from contextlib import chdir
     from pathlib import Path
@@ -141,23 +140,23 @@ def _job(config: DictConfig) -> float | None:
     in_search = objective.LEAST_IOU in os.environ
     numbered = not OmegaConf.is_missing(runtime.job, "num")
     in_sweep = numbered and not in_search
-    compose.register()  # a launcher's process has not done so
+    compose.register()  # not done yet in a launcher's process
     code = 0
     try:
         typed = compose.typed(config)
         typed.threads = typed.threads or launchers.threads_each(runtime)
         folder = Path(runtime.runtime.output_dir)
-        # As they are in Hydra's grammar: resolved, an escaped "${" in a file's name would be lost.
+        # Keep Hydra's grammar: resolving would lose an escaped "${" in a file's name.
         given: Any = OmegaConf.to_container(runtime.overrides.task, resolve=False)
-        if not numbered and (told := unread.note([typed], given)):  # of a sweep: `sweeps.claim`
+        if not numbered and (told := unread.note([typed], given)):  # for sweeps, see `sweeps.claim`
             print(f"note: {told}")
-        with chdir(runtime.runtime.cwd):  # hydra.job.chdir leaves what was typed as it was meant
+        with chdir(runtime.runtime.cwd):  # resolve typed paths despite hydra.job.chdir
             code = run(typed, folder, given, again=not numbered)
     except UserError as error:
         if config.debug or in_search:
             raise
         if not in_sweep:
-            _stop(str(error))  # raised, Hydra would add a line of its own
+            _stop(str(error))  # if raised, Hydra would add its own line
         print(f"styleexp: {error}", file=sys.stderr)
     except Exception:
         if not in_sweep:
@@ -171,7 +170,7 @@ def _job(config: DictConfig) -> float | None:
 
 
 def _list_groups_once() -> None:
-    """Let Hydra copy all configs once, not once for each of the 140 lists in the help: 1.5 s."""
+    """Make Hydra copy all configs once, not for each of the 140 lists in the help (saves 1.5 s)."""
     from functools import cache
 
     from hydra._internal.config_loader_impl import ConfigLoaderImpl
@@ -206,8 +205,8 @@ def _resume(folder: str, others: list[str]) -> None:
 
     if others:
         raise UserError(
-            f"resume= goes on with the configuration of its folder and takes no other argument: "
-            f"drop {' '.join(others)}."
+            "resume= uses the configuration of its folder and takes no other arguments: drop "
+            f"{' '.join(others)}."
         )
     sys.exit(resume(Path(folder)))
 
@@ -217,7 +216,7 @@ def _show_warning(message: Warning | str, *details: object) -> None:
 
 
 def stop(error: UserError) -> NoReturn:
-    """Say what is wrong, with ``debug=true`` also where, and exit with code 2."""
+    """Print the error (with ``debug=true``, the traceback) and exit with code 2."""
     if DEBUG in sys.argv:
         traceback.print_exception(error)
     _stop(str(error))

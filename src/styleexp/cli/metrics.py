@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from styleexp.metrics import Judge
 
 TRUTH_SOURCES = ("sphere", "torus", "critter")
-"""Sources of the truth board that need no files."""
+"""Sources of the truth board, all analytic."""
 COLUMNS = ("rank1", "scale", "noise", "strength", "no_style", "imperfect")
 SHOWN = (
     "source",
@@ -32,7 +32,7 @@ SHOWN = (
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 0, or 2 after printing what the user can mend."""
+    """Run the command; return 0, or 2 after printing a user error."""
     parser = _parser()
     return answer(parser, parser.parse_args(arguments))
 
@@ -40,45 +40,55 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="styleexp-metrics",
-        description="Measure results: how near to the style, how much of the shape was kept. "
-        "docs/metrics.md says what each number means and how far it can be trusted.",
+        description="Measure results: distance to the style, and preservation of the shape. "
+        "docs/metrics.md explains each number and its reliability.",
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    run = commands.add_parser("run", help="measure a finished run's result anew")
+    run = commands.add_parser("run", help="measure a finished run's result again")
     run.add_argument("folder", type=Path)
     run.set_defaults(function=_run, show=_show_one)
 
-    compare = commands.add_parser("compare", help="measure any result, whatever made it")
+    compare = commands.add_parser("compare", help="measure any result, from any tool")
     compare.add_argument("result", type=Path, help="mesh file, in the source's frame")
     compare.add_argument("source", help="mesh file or name")
     compare.add_argument("style", help="mesh or image file, or name")
     compare.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="such as style.scale=2")
     compare.set_defaults(function=_compare, show=_show_one)
 
-    board = commands.add_parser("board", help="measure every run below a folder; tell styles apart")
-    board.add_argument("folder", type=Path)
-    board.add_argument(
-        "--write", action="store_true", help="also write each run's metrics.json anew"
+    board = commands.add_parser(
+        "board", help="measure every run below a folder, and identify their styles"
     )
+    board.add_argument("folder", type=Path)
+    board.add_argument("--write", action="store_true", help="also rewrite each run's metrics.json")
     board.set_defaults(function=_board, show=_show_board)
 
-    truth = commands.add_parser("truth-board", help="test the metrics on results of known style")
+    truth = commands.add_parser(
+        "truth-board", help="test the metrics on results with a known style"
+    )
     truth.add_argument("--sources", default=",".join(TRUTH_SOURCES), help="names, comma-separated")
     truth.add_argument(
-        "--pictures", default="", metavar="NAMES", help="pictures instead of the mesh styles"
+        "--pictures",
+        default="",
+        metavar="NAMES",
+        help="test these pictures instead of the mesh styles",
     )
-    truth.add_argument("--vertices", type=int, default=30_000, help="of each source, about")
+    truth.add_argument(
+        "--vertices", type=int, default=30_000, help="approximate number of vertices of each source"
+    )
     truth.set_defaults(function=_truth, show=_show_truth)
 
     for command in (run, compare, board, truth):
-        command.add_argument("--json", action="store_true", help="everything, as JSON")
+        command.add_argument("--json", action="store_true", help="print everything as JSON")
         command.add_argument("--judge", default="auto", metavar="ENCODER", help=JUDGE_HELP)
-        command.add_argument("--windows", type=int, default=32, help="places looked at (32)")
+        command.add_argument(
+            "--windows", type=int, default=32, help="surface windows to compare (default: 32)"
+        )
     return parser
 
 
-JUDGE_HELP = "encoder that judges, none for metrics without one (an encoder the run did not train)"
+JUDGE_HELP = "encoder used for judging (default: one that the run did not train with); none: skip "
+"its metrics"
 
 
 def _judge(options: argparse.Namespace, trained: str | None = None) -> Judge | None:
@@ -116,7 +126,9 @@ def _board(options: argparse.Namespace) -> dict[str, Any]:
 
     judge = _judge(options)
     if judge is None:
-        raise UserError("--judge none: a board's styles can't be told apart without a judge.")
+        raise UserError(
+            "--judge none: styles can't be identified without a judge; name an encoder."
+        )
     return measure_board(options.folder, judge, options.write)
 
 
@@ -135,7 +147,7 @@ def _truth(options: argparse.Namespace) -> dict[str, Any]:
             sources.append(meshes.remesh(load_source(SourceConfig(name=name)), options.vertices))
     judge = _judge(options)
     if judge is None:
-        raise UserError("--judge none: the truth board tests what a judge sees; name an encoder.")
+        raise UserError("--judge none: the truth board tests a judge; name an encoder.")
 
     def told(what: str) -> None:
         print(what, file=sys.stderr, flush=True)
@@ -148,7 +160,7 @@ def _truth(options: argparse.Namespace) -> dict[str, Any]:
             found = load_style(StyleConfig(name=name))
             if isinstance(found, meshes.Mesh):
                 raise UserError(
-                    f"--pictures: '{name}' is a mesh; without the option all are tested."
+                    f"--pictures: '{name}' is a mesh; omit the option to test all meshes."
                 )
             pictures[name] = found
         board = truth.measure_pictures(sources, pictures, judge.name, options.windows, told)
@@ -176,7 +188,7 @@ def _show_board(found: dict[str, Any]) -> None:
         [[row.get(c, "") for c in SHOWN] for row in found["runs"]],
     )
     print(
-        f"told apart: {found['identification']} of {found['of']} among {found['styles']} styles; "
+        f"identified: {found['identification']} of {found['of']} among {found['styles']} styles; "
         f"silhouette IoU at least {found['min_silhouette_iou']:.3f}; flipped faces at most "
         f"{100 * found['max_flipped']:.2f} %"
     )
@@ -188,7 +200,7 @@ def _show_truth(found: dict[str, Any]) -> None:
         for name, verdict in found["metrics"].items()
     ]
     _table(["metric", *COLUMNS, "kept"], rows)
-    print(f"shares of {found['cases']} cases, judged by {found['judge']}")
+    print(f"fractions of {found['cases']} cases, judged by {found['judge']}")
 
 
 def _table(columns: list[str], rows: list[list[Any]]) -> None:

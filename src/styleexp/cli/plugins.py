@@ -1,4 +1,5 @@
-"""``styleexp-plugins``: every part that can be chosen by name, whose it is, whether it works."""
+"""``styleexp-plugins``: list every part that can be chosen by name, its origin, and whether it
+works."""
 
 from __future__ import annotations
 
@@ -12,16 +13,16 @@ from styleexp import plugins
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; plugins that can't be used are part of the answer, not a failure."""
+    """Run the command; unusable plugins are listed and don't count as a failure."""
     parser = argparse.ArgumentParser(
         prog="styleexp-plugins",
-        description="Renderers, encoders, styles, fields, losses, baselines and loggers, built in "
-        "or from plugins: whose they are, and why they can't be used where they can't. Plugins are "
+        description="Renderers, encoders, styles, fields, losses, baselines and loggers, built "
+        "in or from plugins: their origin, and why unusable ones can't be used. Plugins are "
         f"found in installed packages and in {plugins.VARIABLE} (KIND=MODULE:SPEC, ...).",
     )
-    parser.add_argument("--json", action="store_true", help="as JSON, a list of objects")
+    parser.add_argument("--json", action="store_true", help="print a JSON list of objects")
     options = parser.parse_args(arguments)
-    with warnings.catch_warnings(action="ignore"):  # the list says it
+    with warnings.catch_warnings(action="ignore"):  # the list shows it
         choices = plugins.everything()
     if options.json:
         print(json.dumps([_row(choice) for choice in choices], indent=2))

@@ -1,4 +1,4 @@
-"""What is checked of a run before its folder is made."""
+"""Checks that run before a run's folder is created."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from hydra.experimental.callback import Callback
 
 
 class Preflight(Callback):
-    """Refuse values without a meaning and files that aren't there before anything is written, and
-    before torch is loaded."""
+    """Reject invalid values and missing files before anything is written or torch is imported."""
 
     def on_run_start(self, config: Any, **kwargs: Any) -> None:
-        """Called by Hydra for a single run; what it raises but `SystemExit` Hydra would swallow."""
+        """Called by Hydra for a single run. Hydra swallows any exception except `SystemExit`."""
         from omegaconf import OmegaConf
 
         from styleexp import compose, sources
@@ -21,7 +20,7 @@ class Preflight(Callback):
         from styleexp.errors import UserError
 
         try:
-            ours = [key for key in config if key != "hydra"]  # whose values a run doesn't have yet
+            ours = [key for key in config if key != "hydra"]  # its values aren't resolvable yet
             typed = compose.typed(OmegaConf.masked_copy(config, ours))
             schema.check(typed)
             sources.check(typed)

@@ -1,4 +1,4 @@
-"""``styleexp-report``: pages to look at, of runs, sweeps and the user study."""
+"""``styleexp-report``: HTML pages of runs, sweeps and the user study."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from styleexp.errors import UserError
 
 DESCRIPTION = """\
 Write one self-contained HTML page about a run, or about all runs below a folder, and print its
-path. 'styleexp-report study --help' tells of the user study."""
+path. For the user study, see 'styleexp-report study --help'."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 0, or 2 after printing what the user can mend."""
+    """Run the command; return 0, or 2 after printing a user error."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
         written = study(given[1:]) if given[:1] == ["study"] else report(given)
@@ -32,10 +32,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def report(given: list[str]) -> list[Path]:
-    """The pages that these arguments ask for."""
+    """Write the requested pages; return their paths."""
     options = _parser().parse_args(given)
     if not options.folder.is_dir():
-        raise UserError(f"there is no folder '{options.folder}': give a run's or a sweep's.")
+        raise UserError(f"there is no folder '{options.folder}': give a run's or a sweep's folder.")
     if options.notebooks is not None:
         from styleexp.reports import notebooks
 
@@ -59,7 +59,7 @@ def report(given: list[str]) -> list[Path]:
 
 
 def study(given: list[str]) -> list[Path]:
-    """The study's page, or what its answers say."""
+    """Write the study's page, or analyse its answers."""
     options = _study_parser().parse_args(given)
     if options.analyse:
         from styleexp.reports import study_results
@@ -69,7 +69,9 @@ def study(given: list[str]) -> list[Path]:
             print(f"styleexp-report: {told}", file=sys.stderr)
         return study_results.analyse(found, options.out or options.analyse[0].parent)
     if options.folder is None:
-        raise UserError("give the folder with the runs to be rated, or --analyse and the answers.")
+        raise UserError(
+            "give the folder with the runs to be rated, or --analyse with the answer files."
+        )
     if not options.folder.is_dir():
         raise UserError(f"there is no folder '{options.folder}': give one with finished runs.")
     from styleexp.reports import study as study_page
@@ -83,9 +85,11 @@ def _study_parser() -> argparse.ArgumentParser:
         description="The user study of Fig. 9: write a page on which people rate every finished "
         "run below a folder (study.html), or analyse the files that they saved.",
     )
-    parser.add_argument("folder", type=Path, nargs="?", metavar="FOLDER", help="with the runs")
-    parser.add_argument("--title", default="Rating of stylised meshes", help="of the page")
-    parser.add_argument("--seed", type=int, default=0, help="enters into the order of the pairs")
+    parser.add_argument(
+        "folder", type=Path, nargs="?", metavar="FOLDER", help="folder with the runs"
+    )
+    parser.add_argument("--title", default="Rating of stylised meshes", help="title of the page")
+    parser.add_argument("--seed", type=int, default=0, help="seed for the order of the pairs")
     parser.add_argument(
         "--analyse",
         type=Path,
@@ -93,7 +97,12 @@ def _study_parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help="participants' files: write fig9.png, fig9.csv, ratings.csv and study.json",
     )
-    parser.add_argument("--out", type=Path, metavar="FOLDER", help="for them (the first file's)")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="FOLDER",
+        help="output folder for these files (default: that of the first file)",
+    )
     return parser
 
 
@@ -103,13 +112,15 @@ def _parser() -> argparse.ArgumentParser:
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="of a run, a sweep, or several")
+    parser.add_argument(
+        "folder", type=Path, metavar="FOLDER", help="folder of a run, a sweep, or several"
+    )
     parser.add_argument(
         "--notebooks",
         nargs="*",
         metavar="NAME",
-        help="execute the notebooks of the paper's figures that have runs here, or those named, "
-        "to FOLDER/notebooks",
+        help="execute the notebooks of the paper's figures into FOLDER/notebooks: those named, "
+        "or all that have runs here",
     )
     parser.add_argument("--open", action="store_true", help="open the page in the browser")
     parser.add_argument(

@@ -1,4 +1,4 @@
-"""One run, from its configuration to its folder."""
+"""Execute one run, from its configuration to its folder."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 
 
 SHOWN_METRICS = ("style_distance", "silhouette_iou", "flipped_faces", "spike")
-"""What is printed of metrics.json."""
+"""Metrics printed at the end of a run."""
 
 
 def run(config: Config, folder: Path, overrides: list[str], again: bool = True) -> int:
-    """Stylise and write everything into ``folder``; returns the exit code.
+    """Stylise and write everything into ``folder``; return the exit code.
 
-    Unless ``again``, as in a sweep, a run that is done is not done again, and another run in the
-    folder is refused, not replaced, unless it failed.
+    Without ``again``, as in a sweep, a finished run isn't repeated, and a different run in the
+    folder is an error instead of being replaced, unless it failed.
     """
     with _alone(folder):
         if not again:
@@ -48,42 +48,42 @@ def run(config: Config, folder: Path, overrides: list[str], again: bool = True) 
                 return 0
             if found["status"] == "other" and runs.status(folder) != "failed":
                 raise UserError(
-                    f"'{folder}' is not this job's, {found['reason']}: choose another folder with "
-                    "hydra.sweep.dir=FOLDER, or remove it."
+                    f"'{folder}' doesn't belong to this job: {found['reason']}; choose another "
+                    "folder with hydra.sweep.dir=FOLDER, or remove it."
                 )
         return begin(config, folder, overrides)
 
 
 def begin(config: Config, folder: Path, overrides: list[str]) -> int:
-    """The same for a folder whose lock is held.
+    """Stylise into a folder whose lock is held; return the exit code.
 
-    Where the folder holds the same run, begun and not finished, it is resumed: so a job that a
-    cluster requeues goes on.
+    If the folder holds the same run, unfinished, it is resumed. So a job that a cluster requeues
+    continues.
     """
     record = records.describe(config, overrides, ["styleexp", *overrides]) | origins.noted(config)
     run_folder = records.RunFolder(folder)
     unfinished = run_folder.unfinished(record)
     if unfinished is None and runs.status(folder) in ("running", "interrupted"):
         print(
-            f"note: what was begun in '{folder}' had other settings, files or another version: "
-            "it is replaced"
+            f"note: replacing the unfinished run in '{folder}', which had other settings, files or "
+            "another version"
         )
     return _guarded(config, run_folder, unfinished or record, resumed=unfinished is not None)
 
 
 def resume(folder: Path) -> int:
-    """Go on with an interrupted run from its checkpoint."""
+    """Resume an interrupted run from its checkpoint."""
     record = records.read_record(folder)
     config = origins.restored(record, folder, "resume", print)
     if changed := records.changed_versions(record):
-        print(f"note: the run was begun with {changed}: what follows may differ in its digits")
+        print(f"note: the run was started with {changed}: results may differ slightly")
     with _alone(folder):
         return _guarded(config, records.RunFolder(folder), record, resumed=True)
 
 
 @contextmanager
 def _alone(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock: two processes in one folder would mix their files."""
+    """Hold the folder's lock, so that two processes don't mix their files."""
     try:
         with locks.hold(folder, PATIENCE):
             yield
@@ -94,29 +94,28 @@ def _alone(folder: Path) -> Iterator[None]:
 def _guarded(
     config: Config, folder: records.RunFolder, record: dict[str, Any], resumed: bool
 ) -> int:
-    """Run, and leave a status whatever happens."""
+    """Run, and write a final status in any case."""
     atomic.sweep(folder.path)
-    # What is done is replaced only by what can be begun: a mistyped command costs no result.
+    # Replace a finished run only once the new one can start: a typo must not cost a result.
     replaced = not resumed and runs.status(folder.path) == "done"
     try:
         if not replaced:
             folder.begin(None if resumed else record)
         with announced():
             return _run(config, folder, record, resumed)
-    except BrokenPipeError:  # as with `styleexp ... | head`: the folder is not at fault
-        folder.write_status("interrupted", reason="the output was closed by its reader")
+    except BrokenPipeError:  # as with `styleexp ... | head`; not the folder's fault
+        folder.write_status("interrupted", reason="the output pipe was closed")
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
         if not folder.path.is_dir():
             raise UserError(
-                f"the run's folder '{folder.path}' was removed while the run was at work: start "
-                "the run anew."
+                f"the run's folder '{folder.path}' was removed during the run: start the run again."
             ) from error
         if isinstance(error, FileNotFoundError) and _within(error.filename, folder.path):
             told = (
-                f"files of the run's folder '{folder.path}' were removed while the run was at "
-                "work: start the run anew."
+                f"files of the run's folder '{folder.path}' were removed during the run: start the "
+                "run again."
             )
             folder.forget()
             _fail(folder, told)
@@ -131,17 +130,17 @@ def _guarded(
             folder.write_status("interrupted", reason="stopped by the user")
             again = shlex.join(["styleexp", f"resume={folder.path.absolute()}"])
             with suppress(OSError):
-                print(f"\nstopped; run it again with: {again}", file=sys.stderr)
+                print(f"\nstopped; rerun with: {again}", file=sys.stderr)
         raise
     except Exception as error:
         if not _out_of_memory(error):
             _fail(folder, str(error))
             raise
         asked = re.search(r"allocate (\d+) bytes", str(error))
-        more = f" ({int(asked[1]) / 1e6:.0f} MB more could not be had)" if asked else ""
+        more = f" (failed to allocate {int(asked[1]) / 1e6:.0f} MB)" if asked else ""
         views = "fewer or smaller views (views.count, views.resolution), "
         told = (
-            f"there is not enough memory for this run{more}: take "
+            f"there is not enough memory for this run{more}: use "
             f"{'' if config.baseline else views}a mesh with fewer faces, or fewer runs at once."
         )
         _fail(folder, told)
@@ -155,7 +154,7 @@ def _within(name: object, folder: Path) -> bool:
 
 
 def _out_of_memory(error: BaseException) -> bool:
-    """Whether Python, torch's CPU allocator or CUDA had no memory left."""
+    """Whether Python, torch's CPU allocator or CUDA ran out of memory."""
     import torch
 
     kinds = (MemoryError, torch.OutOfMemoryError)
@@ -163,7 +162,7 @@ def _out_of_memory(error: BaseException) -> bool:
 
 
 def _fail(folder: records.RunFolder, reason: str) -> None:
-    with suppress(OSError):  # where it can't be recorded, it is told all the same
+    with suppress(OSError):  # report the error even if it can't be recorded
         if folder.begun:
             folder.write_status("failed", reason=reason)
 
@@ -184,10 +183,10 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
 
         check_available(config.preview.platform)
     for name in config.logger:
-        plugins.usable("logger", name)  # if it can't be, say so before the run
+        plugins.usable("logger", name)  # if unusable, fail before the run
     judge = metrics.judge_name(config.metrics.judge, config.encoder.name)
     if judge in assets.names("weights"):
-        assets.find(judge, "weights")  # if it can't be had, say so before the run, not after
+        assets.find(judge, "weights")  # if unavailable, fail before the run, not after
     method = baselines.method(config)
     scene = method.prepare(config)
     if not folder.begun:
@@ -199,8 +198,8 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
     for kind, before in (record.get("assets") or {}).items():
         if before["sha256"] != read[kind]["sha256"]:
             raise UserError(
-                f"the {kind} '{read[kind]['path']}' was changed while it was being read: start "
-                "the run anew."
+                f"the {kind} '{read[kind]['path']}' was changed while it was being read: start the "
+                "run again."
             )
     state = method.start(scene)
     if resumed and state is not None:
@@ -210,7 +209,7 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
         print(f"resuming at step {state.step} of {config.optim.steps}")
         lost = folder.begin_metrics(state.step)
         if lost:
-            print(f"note: metrics.jsonl is damaged: the lines of {lost} steps are lost.")
+            print(f"note: metrics.jsonl is damaged: {lost} lines are lost.")
     record |= {
         "device": str(scene.surface.vertices.device),
         "threads": torch.get_num_threads(),
@@ -230,7 +229,7 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
         step = state.step if state else 0
         written, measured = _write_results(result, folder)
         seconds = time.perf_counter() - started
-        if config.report:  # last, as it shows what the others are about
+        if config.report:  # last, because it shows the other files
             from styleexp.reports import page
 
             doing("writing the run's page")
@@ -246,7 +245,7 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
 def _optimise(
     method: Method, scene: Subject, state: State, folder: records.RunFolder, loggers: Loggers
 ) -> bool:
-    """Take the remaining steps; False if the user stopped them."""
+    """Run the remaining steps; return False if the user stopped them."""
     optim = scene.config.optim
     blank = 0
     with _interruptible() as interrupted:
@@ -261,7 +260,7 @@ def _optimise(
                 folder.write_status("interrupted", step=state.step)
                 loggers.ended = "interrupted"
                 again = shlex.join(["styleexp", f"resume={folder.path.absolute()}"])
-                print(f"\nstopped at step {state.step}; go on with: {again}")
+                print(f"\nstopped at step {state.step}; continue with: {again}")
                 return False
     if folder.checkpoint_step() != state.step:
         folder.save_checkpoint(state)
@@ -274,7 +273,7 @@ def _optimise(
 
 
 def _explained(steps: Iterator[Step], folder: records.RunFolder) -> Iterator[Step]:
-    """The steps; where they diverge, the error also names the last good checkpoint."""
+    """Yield the steps; if they diverge, name the last good checkpoint in the error."""
     from styleexp.stylize import Diverged
 
     try:
@@ -283,7 +282,7 @@ def _explained(steps: Iterator[Step], folder: records.RunFolder) -> Iterator[Ste
         good = folder.checkpoint_step()
         kept = "There is no checkpoint yet."
         if good is not None:
-            kept = f"The last good checkpoint is that of step {good}, {folder.checkpoint}."
+            kept = f"The last good checkpoint is from step {good}: {folder.checkpoint}."
         raise UserError(f"{error} {kept}") from None
 
 
@@ -312,7 +311,7 @@ def _write_results(
 
 
 def _measure(result: Result, config: Config) -> dict[str, float]:
-    """The metrics, against the result's own source: a baseline may have divided its faces."""
+    """Measure against the result's own source, whose faces a baseline may have subdivided."""
     from styleexp import metrics
 
     name = metrics.judge_name(config.metrics.judge, config.encoder.name)
@@ -323,8 +322,8 @@ def _measure(result: Result, config: Config) -> dict[str, float]:
 
 @contextmanager
 def _interruptible() -> Iterator[list[int]]:
-    """A list that a first Ctrl-C (or SIGTERM, or a closed terminal) fills; a second one stops at
-    once."""
+    """Yield a list that the first Ctrl-C (or SIGTERM, or a closed terminal) appends to; a second
+    one stops at once."""
     caught: list[int] = []
 
     def note(number: int, frame: Any) -> None:
@@ -333,7 +332,7 @@ def _interruptible() -> Iterator[list[int]]:
         caught.append(number)
 
     signals = [signal.SIGINT, signal.SIGTERM]
-    # Windows has no SIGHUP, and under nohup it is to be ignored.
+    # Windows has no SIGHUP, and nohup ignores it.
     hangup = getattr(signal, "SIGHUP", None)
     if hangup is not None and signal.getsignal(hangup) is not signal.SIG_IGN:
         signals.append(hangup)
@@ -346,7 +345,7 @@ def _interruptible() -> Iterator[list[int]]:
 
 
 def _progress(steps: Iterator[Step], state: State, total: int) -> Iterator[Step]:
-    """Show each step: a bar on a terminal, a plain line now and then elsewhere."""
+    """Show progress: a bar on a terminal, else an occasional line."""
     from rich.console import Console
 
     if not Console().is_terminal:

@@ -1,4 +1,4 @@
-"""``styleexp-sweep``: run a plan of experiments, show where it is, collect what came out."""
+"""``styleexp-sweep``: run a plan of experiments, show its status, collect its results."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; 0 if all jobs are done, 2 if not or for what the user can mend."""
+    """Run the command; return 0 if all jobs are done, else 2, also after a user error."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     commands = {"status": _status, "collect": _collect}
     try:
@@ -33,27 +33,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"styleexp-sweep: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("stopped; the same command goes on from here.", file=sys.stderr)
+        print("stopped; repeat the command to continue.", file=sys.stderr)
         return 130
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="styleexp-sweep",
-        description="Run a plan of experiments, or go on with it: done jobs are skipped, those "
-        "that died are resumed. Any number of runners may share a folder.",
+        description="Run or continue a plan of experiments: finished jobs are skipped, killed "
+        "jobs are resumed. Any number of runners may share a folder.",
         epilog="styleexp-sweep status FOLDER shows every job; styleexp-sweep collect FOLDER writes "
         "runs.csv and runs.parquet.",
     )
-    parser.add_argument("plan", type=Path, metavar="PLAN", help="a file of sweeps/")
+    parser.add_argument("plan", type=Path, metavar="PLAN", help="a plan file, see sweeps/")
     parser.add_argument(
-        "overrides", nargs="*", metavar="KEY=VALUE", help="of every job: profile=standard; those "
-        "that begin with hydra. are the launcher's: hydra.launcher.partition=gpu",
+        "overrides", nargs="*", metavar="KEY=VALUE", help="overrides for every job, "
+        "e.g. profile=standard; those that begin with hydra. configure the launcher, "
+        "e.g. hydra.launcher.partition=gpu",
     )  # fmt: skip
     parser.add_argument("--folder", type=Path, help="default: outputs/ and the plan's name")
     parser.add_argument("--launcher", metavar="NAME", help="basic, joblib, submitit_local, "
                         "submitit_slurm or ray; default: the plan's")  # fmt: skip
-    parser.add_argument("--jobs", type=int, metavar="N", help="run N jobs side by side")
+    parser.add_argument("--jobs", type=int, metavar="N", help="run N jobs in parallel")
     parser.add_argument("--retry", action="store_true", help="run failed jobs again")
     parser.add_argument("--dry-run", action="store_true", help="print the commands, run nothing")
     return parser
@@ -72,10 +73,10 @@ def _run(options: argparse.Namespace) -> int:
     if home is not None and home.absolute() != Path.cwd():
         if not home.is_dir():
             raise UserError(
-                f"the plan in '{folder}' was begun in '{home}', from where its files are named, "
-                "and that folder is gone: put it back, or choose another --folder."
+                f"the plan in '{folder}' was started in '{home}', which its relative paths refer "
+                "to, but that folder is missing: restore it, or choose another --folder."
             )
-        print(f"note: files are named from '{home}', where this plan was begun.", flush=True)
+        print(f"note: relative paths refer to '{home}', where this plan was started.", flush=True)
         options.plan, folder = options.plan.absolute(), folder.absolute()
         os.chdir(home)
     own = [each for each in options.overrides if each.startswith("hydra.")]
@@ -103,7 +104,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _report(read: Plan, by_entry: dict[str, list[Planned]], folder: Path) -> int:
-    """Tables and figures of every experiment; the exit code."""
+    """Write tables and figures of every experiment; return the exit code."""
     from styleexp.reports import runs
     from styleexp.sweeps.report import report
 
@@ -119,7 +120,7 @@ def _report(read: Plan, by_entry: dict[str, list[Planned]], folder: Path) -> int
 def _show_commands(
     read: Plan, by_entry: dict[str, list[Planned]], overrides: Sequence[str]
 ) -> None:
-    """The commands, each experiment's figure and cost above; what is done already is marked."""
+    """Print the commands, with each experiment's figure and cost, and mark finished jobs."""
     from styleexp.reports import runs
 
     given = [o.removeprefix("profile=") for o in overrides if o.startswith("profile=")]
@@ -128,7 +129,7 @@ def _show_commands(
     for entry in read.experiments:
         assert entry.name is not None
         minutes = entry.minutes.get(profile)
-        cost = "cost not known" if minutes is None else f"about {minutes:g} minutes on two cores"
+        cost = "unknown cost" if minutes is None else f"about {minutes:g} minutes on two cores"
         total += minutes or 0
         print(f"# {entry.name}{f', {entry.figure}' if entry.figure else ''}: {cost}")
         for job in by_entry[entry.name]:
@@ -150,7 +151,7 @@ def _status(folder: Path) -> int:
 
     jobs = manifest.read(folder)
     if not jobs:
-        raise UserError(f"'{folder}' is no plan's folder: it has no {manifest.NAME}.")
+        raise UserError(f"'{folder}' is not a plan's folder: it has no {manifest.NAME}.")
     table = Table(title=str(folder))
     for column in ("job", "state", "step", "attempts", "time"):
         table.add_column(column, overflow="fold")

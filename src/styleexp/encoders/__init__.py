@@ -1,6 +1,6 @@
-"""Multi-layer encoders: VGG activations of a picture, by layer name (paper Sec. 3.3.2).
+"""Multi-layer encoders: VGG activations of an image, by layer name (paper Sec. 3.3.2).
 
-Importing this package is cheap: torch is loaded by the first ``load_encoder`` call.
+Importing this package is cheap: torch is imported by the first ``load_encoder`` call.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""CLIP's image tower, for Text2Mesh's loss: one embedding of a whole picture, no layers.
+"""CLIP's image tower, for Text2Mesh's loss: one embedding of a whole image, no layers.
 
-Read with transformers from a folder of the user's; nothing is downloaded.
+Loaded with transformers from a folder provided by the user; nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 MEAN = (0.48145466, 0.4578275, 0.40821073)
 STD = (0.26862954, 0.26130258, 0.27577711)
-"""Input normalisation that CLIP was trained with (Radford et al. 2021), RGB."""
+"""CLIP's input normalisation (Radford et al. 2021), RGB."""
 
 WANTED = "a folder with config.json and model.safetensors, as transformers saves a CLIP model"
 
 
 class ClipEncoder(nn.Module):
-    """Pictures to unit embeddings; frozen, in fp32. Gradients flow to the pictures."""
+    """Maps images to unit embeddings. Frozen, in fp32; gradients flow to the images."""
 
     mean: Tensor
     std: Tensor
@@ -42,13 +42,13 @@ class ClipEncoder(nn.Module):
         self.eval()
 
     def resolve(self, layers: Sequence[str | int]) -> tuple[str, ...]:
-        """CLIP serves no layers: a `UserError` that says which loss it is for."""
+        """Raise `UserError`: CLIP has no layers; it only works with ``loss=clip``."""
         raise UserError("encoder=clip has no layers for this loss: use loss=clip with it.")
 
     def forward(
         self, images: Float[Tensor, "images channels height width"]
     ) -> Float[Tensor, "images size"]:
-        """Embeddings of unit length of pictures in [0, 1], RGB or grey, resized to CLIP's input."""
+        """Unit embeddings of images in [0, 1], RGB or grey, resized to CLIP's input."""
         size = [self.size, self.size]
         images = functional.interpolate(images, size, mode="bicubic", antialias=True)
         images = (images.expand(-1, 3, -1, -1) - self.mean) / self.std
@@ -56,17 +56,17 @@ class ClipEncoder(nn.Module):
 
 
 def load(path: str, device: str | torch.device) -> ClipEncoder:
-    """The image tower of a CLIP model in transformers' format.
+    """Load the image tower of a CLIP model in transformers' format.
 
-    Raises `UserError` where the folder holds none, or not all of its weights.
+    Raises `UserError` if the folder has no model, or lacks some of its weights.
     """
     from transformers import CLIPVisionModelWithProjection
     from transformers.utils import logging
 
     if not (Path(path) / "config.json").is_file():
-        raise UserError(f"encoder.weights={path} is no CLIP model: give {WANTED}.")
+        raise UserError(f"encoder.weights={path} is not a CLIP model: give {WANTED}.")
     shown, bars = logging.get_verbosity(), logging.is_progress_bar_enabled()
-    logging.set_verbosity_error()  # a whole CLIP model has a text tower, too, which isn't needed
+    logging.set_verbosity_error()  # silence warnings about the unused text tower
     logging.disable_progress_bar()
     try:
         tower, told = CLIPVisionModelWithProjection.from_pretrained(
@@ -76,7 +76,7 @@ def load(path: str, device: str | torch.device) -> ClipEncoder:
             output_loading_info=True,
             dtype=torch.float32,
         )
-    except Exception as error:  # of many kinds, for damaged, foreign or absent files
+    except Exception as error:  # many kinds, for damaged, foreign or missing files
         reason = str(error).strip().splitlines() or [type(error).__name__]
         raise UserError(
             f"encoder.weights={path} can't be read ({reason[0].rstrip('.:')}): give {WANTED}."
@@ -88,7 +88,7 @@ def load(path: str, device: str | torch.device) -> ClipEncoder:
     if told["missing_keys"] or told["mismatched_keys"]:
         lacks = sorted(map(str, {*told["missing_keys"], *told["mismatched_keys"]}))
         raise UserError(
-            f"encoder.weights={path} lacks {len(lacks)} of CLIP's image weights, {lacks[0]} among "
-            f"them: give {WANTED}."
+            f"encoder.weights={path} lacks {len(lacks)} of CLIP's image weights, such as "
+            f"{lacks[0]}: give {WANTED}."
         )
     return ClipEncoder(tower).to(device)

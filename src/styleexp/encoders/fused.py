@@ -1,11 +1,11 @@
-"""Gram matrices of a VGG's layers as one autograd step, on a CPU with oneDNN.
+"""Gram matrices of a VGG's layers as a single autograd function, for CPUs with oneDNN.
 
-Most of what autograd takes besides the convolutions goes into passes over fresh memory: masked
-copies, gradients of each layer by itself, sums of them. Here a convolution and its ReLU are one
-pass, a layer's Gram matrix is taken while its activations are at hand, and its gradient is added
-to that of the layers above by the very product that makes it. Images go through a block in parts,
-so that no array is so large that the allocator would give it back to the system after use and
-fetch fresh pages for the next.
+Apart from convolutions, plain autograd spends most time on passes over fresh memory: masked copies,
+separate gradients per layer, and their sums. Here a convolution and its ReLU are one pass, a
+layer's Gram matrix is computed while its activations are in cache, and its gradient is accumulated
+into that of the layers above by the same matrix product. Images go through a block in parts, so
+that no array is large enough for the allocator to return it to the system and map fresh pages for
+the next.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ if TYPE_CHECKING:
     Mask = Bool[Tensor, "images rows columns"] | None
 
 BITS = {torch.float32: torch.int32, torch.bfloat16: torch.int16}
-"""What can be fused, and integers of the same size. Activations are never negative, so they order
-as their bits do, and torch is three times as fast with 16-bit integers as with bfloat16."""
+"""Supported dtypes, and integer dtypes of the same size. Activations are non-negative, so they sort
+like their bits, and torch is three times as fast with 16-bit integers as with bfloat16."""
 
 PART = 16 << 20
-"""Bytes of a part's activations. glibc maps arrays above 32 MB anew each time."""
+"""Bytes of activations per part. glibc maps fresh pages for arrays above 32 MB."""
 ROWS = 2048
-"""Cells whose product is rounded at once; the sums of those are float32's."""
+"""Cells per partial product, which is rounded; partial products are summed in float32."""
 EVEN = 256
-"""Masked cells are filled up with zeros to a multiple of this. oneDNN keeps code and memory for
-each of a thousand shapes; masks that gave it new ones each step filled 9 GB in a hundred steps."""
+"""Masked cells are zero-padded to a multiple of this. oneDNN caches code and memory for up to a
+thousand shapes; masks with new shapes in every step filled 9 GB in a hundred steps."""
 
 _ONE, _TWO = [1, 1], [2, 2]
 _PORTION = 1 << 20
-"""Bytes of activations that are pooled at once, so that what is between fits the cache."""
+"""Bytes of activations pooled at once, so that intermediates fit the cache."""
 
 
 class Layer(NamedTuple):
-    """A convolution; ``back`` is the kernel that takes its gradient back to its input."""
+    """A convolution; ``back`` is the kernel of its input gradient."""
 
     name: str
     weight: Float[Tensor, "out in 3 3"]
@@ -52,19 +52,19 @@ class Layer(NamedTuple):
 
 @dataclass
 class _Part:
-    """What the backward pass needs of some images in a block."""
+    """Saved state of the backward pass, for some images in a block."""
 
     images: slice
     activations: list[Tensor] = field(default_factory=list)
     ahead: Tensor | None = None
-    """Of a max-pooling: by how much each second of two cells exceeds the first; see `_pool`."""
+    """For max-pooling: by how much the second of each two cells exceeds the first; see `_pool`."""
 
 
 class GramSums(torch.autograd.Function):
-    """F^T F of layers, summed over images and masked cells, in the order of ``masks``.
+    """F^T F per layer, summed over images and masked cells, in the order of ``masks``.
 
-    Takes normalised images (channels last), the layers block by block, for each layer asked for
-    its mask or None, and ``max`` or ``avg``. The last layer must be one asked for.
+    Takes normalised images (channels last), the layers grouped by block, a mask or None for each
+    requested layer, and ``max`` or ``avg``. The last layer must be a requested one.
     """
 
     @staticmethod
@@ -75,7 +75,7 @@ class GramSums(torch.autograd.Function):
         masks: Mapping[str, Mask],
         pooling: str,
     ) -> tuple[Tensor, ...]:
-        """Block by block; within a block part by part."""
+        """Process blocks in order, and each block part by part."""
         sums: dict[str, list[Tensor]] = {name: [] for name in masks}
         ctx.kept, ctx.given = [], (blocks, masks, pooling)
         x = images
@@ -100,9 +100,9 @@ class GramSums(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        """Frees activations as it goes, so there is no second one."""
+        """Frees activations on the way, so it can only run once."""
         if not ctx.kept:
-            raise RuntimeError("the encoder frees its activations: it has no second backward pass")
+            raise RuntimeError("the encoder frees its activations: backward can only run once")
         blocks, masks, pooling = ctx.given
         factors = {name: grad + grad.t() for name, grad in zip(masks, grads, strict=True)}
         grad: Tensor | None = None
@@ -110,7 +110,8 @@ class GramSums(torch.autograd.Function):
             parts, pooled = ctx.kept.pop()
             is_off = pooling == "max" and block[-1].name not in masks
             if grad is not None and is_off:
-                # Off after a max-pooling is off before it, where there are four times as many.
+                # Zero after max-pooling implies zero before it, where there are four times as many
+                # cells.
                 zero_where_zero(grad, pooled)
             del pooled
             into = []
@@ -135,8 +136,8 @@ class GramSums(torch.autograd.Function):
 
 
 def gram(activation: Tensor, mask: Mask) -> Float[Tensor, "channels channels"]:
-    """F^T F over masked cells. Summed in float32 every ``ROWS`` cells: bfloat16's own rounding, of
-    products of so many, stays below 0.2 %."""
+    """F^T F over masked cells, summed in float32 every ``ROWS`` cells, which keeps the rounding
+    error of bfloat16 below 0.2 %."""
     cells = activation.permute(0, 2, 3, 1).flatten(0, 2)
     if mask is not None:
         seen = mask.flatten().nonzero().view(-1)
@@ -150,25 +151,26 @@ def gram(activation: Tensor, mask: Mask) -> Float[Tensor, "channels channels"]:
 
 
 def add_gram_gradient(grad: Tensor, activation: Tensor, mask: Mask, factor: Tensor) -> None:
-    """Add F (D + D^T), 0 outside of the mask, to the gradient in place."""
+    """Add F (D + D^T), 0 outside the mask, to the gradient in place."""
     cells = activation.permute(0, 2, 3, 1)
     if mask is not None:
         bits = BITS[activation.dtype]
-        # Of one type: turning truth values into numbers on the way takes longer than the product.
+        # Same dtype: converting booleans on the fly takes longer than the product.
         cells = (cells.view(bits) * mask.to(bits)[..., None]).view(activation.dtype)
     rows = grad.permute(0, 2, 3, 1).flatten(0, 2)
     rows.addmm_(cells.flatten(0, 2), factor.to(activation.dtype))
 
 
 def zero_where_zero(grad: Tensor, activation: Tensor) -> None:
-    """Set the gradient to 0 where the ReLU did, in place."""
+    """Set the gradient to 0 where the ReLU output is 0, in place."""
     bits = BITS[activation.dtype]
     out = grad.view(bits)
     torch.ops.aten.threshold_backward.grad_input(out, activation.view(bits), 0, grad_input=out)
 
 
 def _split(x: Tensor, channels: int) -> Iterator[tuple[slice, Tensor]]:
-    """As many images at once as make ``PART`` bytes of this many channels."""
+    """Yield chunks of images whose activations, with this many channels, take about ``PART``
+    bytes."""
     size = channels * x.shape[2] * x.shape[3] * x.element_size()
     step = max(1, PART // size)
     for start in range(0, len(x), step):
@@ -177,7 +179,8 @@ def _split(x: Tensor, channels: int) -> Iterator[tuple[slice, Tensor]]:
 
 
 def _pool(x: Tensor, pooling: str) -> tuple[Tensor, Tensor | None]:
-    """2x2 pooling; of a maximum also what `_unpool` needs, a sixth of torch's indices' size."""
+    """2x2 pooling. For ``max``, also return what `_unpool` needs, a sixth of the size of torch's
+    indices."""
     if pooling == "avg":
         return functional.avg_pool2d(x, 2), None
     bits = x.permute(0, 2, 3, 1).view(BITS[x.dtype])
@@ -193,7 +196,7 @@ def _pool(x: Tensor, pooling: str) -> tuple[Tensor, Tensor | None]:
 
 
 def _unpool(grad: Tensor, x: Tensor, ahead: Tensor | None, pooling: str) -> Tensor:
-    """The gradient of ``_pool``: to the first of equal ones."""
+    """Gradient of ``_pool``; ties go to the first cell."""
     if ahead is None:
         return torch.ops.aten.avg_pool2d_backward(grad, x, _TWO, _TWO, [0, 0], False, True, None)
     towards = grad.permute(0, 2, 3, 1).contiguous().view(BITS[x.dtype])
@@ -212,8 +215,8 @@ def _unpool(grad: Tensor, x: Tensor, ahead: Tensor | None, pooling: str) -> Tens
 
 
 def _quarters(cells: Tensor) -> Iterator[tuple[tuple[int, slice], tuple[Tensor, ...]]]:
-    """Of (images, rows, columns, channels), in portions that fit the cache: where in the pooled
-    array, and the four cells of each 2x2."""
+    """Yield portions of (images, rows, columns, channels) that fit the cache: the index into the
+    pooled array, and the four cells of each 2x2 block."""
     images, height, width, channels = cells.shape
     rows = max(1, _PORTION // (2 * width * channels * cells.element_size()))
     for image in range(images):
@@ -232,6 +235,6 @@ def _at(mask: Mask, images: slice) -> Mask:
 
 
 def _convolve(x: Tensor, weight: Tensor, bias: Tensor | None, then: str) -> Tensor:
-    """A 3x3 convolution with padding 1, ``then`` a ``relu`` or ``none``, in one pass."""
+    """A 3x3 convolution with padding 1, fused with ``then``: ``relu`` or ``none``."""
     convolution = torch.ops.mkldnn._convolution_pointwise
     return convolution(x, weight, bias, _ONE, _ONE, _ONE, 1, then, [], "")

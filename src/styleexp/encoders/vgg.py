@@ -1,4 +1,4 @@
-"""A frozen VGG that runs once and serves every layer asked for."""
+"""A frozen VGG that returns all requested layers in one pass."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ VGG16_CONVS = (2, 2, 3, 3, 3)
 VGG19_CONVS = (2, 2, 4, 4, 4)
 CHANNELS = (64, 128, 256, 512, 512)
 PAPER_LAYERS = layer_names(VGG19_CONVS)
-"""The paper's index i is PAPER_LAYERS[i - 1]: 1 = conv1_1, 5 = conv3_1, 13 = conv5_1."""
+"""Layers by the paper's index: i is PAPER_LAYERS[i - 1], so 1 = conv1_1, 5 = conv3_1, 13 =
+conv5_1."""
 PAPER_MEAN = (0.481, 0.458, 0.408)
 PAPER_STD = (0.268, 0.261, 0.276)
 
@@ -40,10 +41,9 @@ _PRECISION_NAMES = {torch.float32: "fp32", torch.bfloat16: "bf16", torch.float64
 class Encoder(nn.Module):
     """VGG activations by layer name.
 
-    The network is 3x3 convolutions with zero padding 1, ReLU, and 2x2 pooling between blocks. The
-    served activations are those *after* the ReLU, unless ``activations`` is ``conv``, in the
-    compute dtype (``precision``). Weights are
-    frozen; gradients flow to the images.
+    The network consists of 3x3 convolutions with zero padding 1, ReLU, and 2x2 pooling between
+    blocks. Activations are taken *after* the ReLU, unless ``activations`` is ``conv``, in the
+    compute dtype (``precision``). Weights are frozen; gradients flow to the images.
     """
 
     mean: Tensor
@@ -62,11 +62,11 @@ class Encoder(nn.Module):
         """Build it in fp32 on the CPU.
 
         Args:
-            name: for messages and records.
+            name: name in messages and records.
             weights: convolutions ``convB_I`` in torchvision's convention.
             pooling: ``max`` or ``avg``.
             activations: ``relu``, or ``conv`` for those before the ReLU.
-            mean: input normalisation, RGB; that of the weights unless given.
+            mean: input normalisation, RGB. Default: that of the weights.
             std: likewise.
         """
         super().__init__()
@@ -93,18 +93,18 @@ class Encoder(nn.Module):
 
     @property
     def precision(self) -> str:
-        """``fp32`` or ``bf16``: what it computes in, read from the weights themselves."""
+        """Compute precision, ``fp32`` or ``bf16``, derived from the weights' dtype."""
         dtype = next(self.convs.parameters()).dtype
         return _PRECISION_NAMES.get(dtype, str(dtype))
 
     def resolve(self, layers: Sequence[str | int]) -> tuple[str, ...]:
-        """Layer names for names and for the paper's 1-based convolution indices of VGG-19.
+        """Resolve names, and the paper's 1-based convolution indices of VGG-19, to layer names.
 
         The paper's [1, 3, 5, 9, 13] is conv1_1, conv2_1, conv3_1, conv4_1, conv5_1 for every
-        encoder: an index stands for the name, not for the position in a shallower network.
+        encoder: an index means the name, not the position in a shallower network.
 
         Raises:
-            UserError: a layer that this encoder does not have, one named twice, or none at all.
+            UserError: a layer that this encoder doesn't have, a duplicate, or an empty list.
         """
         names: list[str] = []
         for layer in [layers] if isinstance(layers, str) else layers:
@@ -124,11 +124,11 @@ class Encoder(nn.Module):
                     )
                 raise unknown_name(f"layer of the encoder '{self.name}'", text, self.layer_names)
             if text in names:
-                raise UserError(f"the layer {text} is named twice in {list(layers)}.")
+                raise UserError(f"the layer {text} is given twice in {list(layers)}.")
             names.append(text)
         if not names:
             raise UserError(
-                f"no encoder layer is named; '{self.name}' has {', '.join(self.layer_names)}."
+                f"no encoder layer is given; '{self.name}' has {', '.join(self.layer_names)}."
             )
         return tuple(names)
 
@@ -146,19 +146,19 @@ class Encoder(nn.Module):
         images: Float[Tensor, "images channels height width"],
         layers: Sequence[str | int],
     ) -> dict[str, Float[Tensor, "images features rows columns"]]:
-        """Run to the deepest layer asked for and return the activations of all that are.
+        """Run up to the deepest requested layer and return the activations of all requested layers.
 
         Args:
-            images: in [0, 1]; RGB, or grey (one channel, taken as R = G = B).
+            images: in [0, 1]; RGB, or grey (one channel, used as R = G = B).
             layers: names or the paper's indices.
 
         Returns:
             Name -> activations (see the class) in the compute dtype, in the order of ``layers``;
-            rows are ``height // stride``. Do not write into them: the backward pass needs them.
+            rows are ``height // stride``. Don't modify them: the backward pass needs them.
 
         Raises:
             UserError: an unknown layer, or images too small for the deepest layer.
-            ValueError: another shape or an integer type.
+            ValueError: a wrong shape or an integer dtype.
         """
         names = self.resolve(layers)
         x, run = self._prepare(images, names)
@@ -171,8 +171,8 @@ class Encoder(nn.Module):
             if self.activations == "conv":
                 served[layer], x = x, x.relu()
             else:
-                # In place on the convolution's own output, which nothing else needs; what comes
-                # next makes a new tensor, so served activations stay as they are.
+                # In place on the convolution's output, which is not needed elsewhere; the next
+                # layer makes a new tensor, so returned activations stay intact.
                 served[layer] = x = x.relu_()
         return {name: served[name] for name in names}
 
@@ -190,18 +190,18 @@ class Encoder(nn.Module):
         images: Float[Tensor, "images channels height width"],
         masks: Mapping[str, Bool[Tensor, "images rows columns"] | None],
     ) -> dict[str, Float[Tensor, "features features"]]:
-        """F^T F of the activations that ``forward`` gives, which are not kept: much cheaper.
+        """F^T F of the activations of ``forward``, without keeping them, which is much cheaper.
 
         Args:
             images: as for ``forward``.
-            masks: for each layer, by its resolved name, which cells are summed; None is all.
+            masks: cells to sum, for each layer by its resolved name; None means all.
 
         Returns:
-            Name -> the sum over images and cells in float32, in the order of ``masks``. It has one
-            backward pass.
+            Name -> sum over images and cells in float32, in the order of ``masks``. Backward can
+            only run once.
 
         Raises:
-            as ``forward``.
+            The same as ``forward``.
         """
         x, run = self._prepare(images, tuple(masks))
         blocks = [
@@ -212,7 +212,7 @@ class Encoder(nn.Module):
         return dict(zip(masks, found, strict=True))
 
     def _layer(self, name: str) -> fused.Layer:
-        """A convolution for `gram_sums`; the turned kernel is kept for the next."""
+        """A convolution for `gram_sums`, with a cached transposed kernel."""
         weight, bias = (self.convs[name].get_parameter(each) for each in ("weight", "bias"))
         now = weight.data_ptr(), weight._version, weight.dtype
         if name not in self._turned or self._turned[name][0] != now:
@@ -235,8 +235,9 @@ class Encoder(nn.Module):
                 f"'{self.name}': it needs at least {self.stride(deepest)} pixels on each side."
             )
         dtype = next(self.convs.parameters()).dtype
-        # Normalised before rounding to the compute dtype: near the mean bf16 is then finest. A grey
-        # image becomes three channels here; collapsing the first kernel instead saves no time.
+        # Normalise before rounding to the compute dtype, so that bf16 is most precise near the
+        # mean. A grey image becomes three channels here; collapsing the first kernel instead saves
+        # no time.
         x = ((images - self.mean) / self.std).to(dtype, memory_format=torch.channels_last)
         return x, self.layer_names[: self.layer_names.index(deepest) + 1]
 
@@ -257,7 +258,8 @@ def build(
     normalisation: str,
     device: str | torch.device,
 ) -> Encoder:
-    """An :class:`Encoder` in its final precision and place; options as in ``load_encoder``."""
+    """Build an :class:`Encoder` in its final precision and on its device; options as in
+    ``load_encoder``."""
     device = torch.device(device)
     paper = normalisation == "paper"
     encoder = Encoder(
@@ -271,15 +273,15 @@ def build(
     chosen = fastest_precision(device) if precision == "auto" else precision
     if chosen == "bf16":
         if precision == "bf16" and fastest_precision(device) != "bf16":
-            log.warning("bf16 was asked for, but this %s does not gain from it.", device.type)
+            log.warning("bf16 was requested, but this %s is not faster with it.", device.type)
         encoder.convs.to(torch.bfloat16)
-    # channels_last is what the fast convolutions read; only 4-D tensors change their layout.
+    # The fast convolutions need channels_last; only 4-D tensors change their layout.
     encoder.convs.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return encoder.to(device)
 
 
 def fastest_precision(device: torch.device) -> str:
-    """``bf16`` where the hardware multiplies it natively, else ``fp32``.
+    """``bf16`` if the hardware multiplies it natively, else ``fp32``.
 
     Measured for VGG-16 to conv5_1, five 250x250 images, forward and input gradient, on two cores
     with AMX: 0.3 s in bf16, 1.3 s in fp32. Without AMX or AVX512-BF16 bf16 is emulated and slower.
@@ -294,7 +296,7 @@ def fastest_precision(device: torch.device) -> str:
 
 
 def random_weights(convs_per_block: Sequence[int], seed: int) -> VGGWeights:
-    """He-initialised convolutions from a generator of their own; biases are zero."""
+    """He-initialised convolutions from a separate generator; biases are zero."""
     generator = np.random.default_rng(seed)
     tensors: dict[str, np.ndarray] = {}
     fan_in = 3

@@ -1,8 +1,8 @@
-"""Published VGG weights, brought into one convention and one file format.
+"""Published VGG weights, converted to one convention and one file format.
 
 The convention is torchvision's: RGB input in [0, 1], ``(x - mean) / std`` first, cross-correlation
-kernels of shape (out, in, 3, 3). Files are safetensors whose header carries the mean, the std,
-where the weights came from and a digest of the content: one atomic file is all there is to check.
+kernels of shape (out, in, 3, 3). Files are safetensors whose header holds the mean, the std, the
+weights' origin and a digest of the content, so each file can be verified on its own.
 """
 
 from __future__ import annotations
@@ -33,21 +33,21 @@ class VGGWeights:
     tensors: Arrays
     """``conv1_1.weight`` (out, in, 3, 3), ``conv1_1.bias`` (out,), ... as float32."""
     mean: tuple[float, ...]
-    """RGB, in units of [0, 1]."""
+    """Mean of the input, RGB in [0, 1]."""
     std: tuple[float, ...]
     source: str = ""
-    """sha256 of the published file, or empty."""
+    """SHA-256 of the published file, or empty."""
 
 
 class DamagedWeights(Exception):
-    """A weights file that cannot be read or is not what it says."""
+    """A weights file that can't be read or doesn't match its digest."""
 
 
 # ---------------------------------------------------------------------------- converters
 
 
 def from_caffe(tensors: Arrays) -> VGGWeights:
-    """Caffe's input convention (BGR, 0-255, mean subtracted) turned into torchvision's, exactly.
+    """Convert Caffe's input convention (BGR, 0-255, mean subtracted) to torchvision's, exactly.
 
     ``w_rgb[:, c] = w_bgr[:, 2 - c] * 255 * std_c``. The mean stays Caffe's: zero padding happens
     after the subtraction, so another mean could not be folded into the bias at the border.
@@ -94,7 +94,7 @@ def from_torchvision(path: str | Path) -> VGGWeights:
     """torchvision's VGG-19 state dict; only the convolutions (``features.*``) are kept."""
     import torch
 
-    # The published file is in torch's format of 2017, which cannot be memory-mapped.
+    # The published file uses torch's 2017 format, which can't be memory-mapped.
     state = torch.load(path, map_location="cpu", weights_only=True)
     indices = sorted(
         {int(key.split(".")[1]) for key in state if re.fullmatch(r"features\.\d+\.weight", key)}
@@ -120,7 +120,7 @@ def layer_names(convs_per_block: tuple[int, ...]) -> tuple[str, ...]:
 
 
 def _checked(found: Arrays, convs_per_block: tuple[int, ...]) -> Arrays:
-    """``found`` as contiguous float32, in the network's order, if it is a whole, finite VGG."""
+    """Validate a complete, finite VGG; return it as contiguous float32, in the network's order."""
     names = layer_names(convs_per_block)
     wanted = [f"{name}.{kind}" for name in names for kind in ("weight", "bias")]
     if missing := sorted(set(wanted) - set(found)):
@@ -140,12 +140,12 @@ def _checked(found: Arrays, convs_per_block: tuple[int, ...]) -> Arrays:
 
 
 def write(path: str | Path, weights: VGGWeights, source: str, credit: str) -> None:
-    """Write a safetensors file in one step: readers see the old file or the whole new one.
+    """Write a safetensors file atomically: readers see the old file or the complete new one.
 
     Args:
         path: the file; its folder exists.
         weights: what to store.
-        source: sha256 of the published file that it was made from.
+        source: SHA-256 of the published file it was made from.
         credit: author and licence, kept with the copy.
     """
     from safetensors.numpy import save
@@ -165,8 +165,8 @@ def read(path: str | Path) -> VGGWeights:
     """Read and verify a file that :func:`write` made.
 
     Raises:
-        DamagedWeights: truncated, altered, or another kind of file.
-        OSError: there is no such file, or it may not be read.
+        DamagedWeights: truncated, altered, or a different kind of file. OSError: the file is
+        missing or not readable.
     """
     from safetensors import SafetensorError
     from safetensors.numpy import load

@@ -1,8 +1,7 @@
-"""What a run also tells the tools that people already use; ``metrics.jsonl`` is always written.
+"""Loggers: send a run's numbers to other tools. ``metrics.jsonl`` is always written.
 
-``logger=tensorboard``, ``logger=mlflow``, ``'logger=[tensorboard,mlflow]'``. A logger listens: it
-can't change a run, so it doesn't count for the keys of plans, and one that breaks is dropped with a
-warning.
+``logger=tensorboard``, ``logger=mlflow``, ``'logger=[tensorboard,mlflow]'``. A logger can't change
+a run, so it doesn't affect job keys, and one that fails is dropped with a warning.
 """
 
 from __future__ import annotations
@@ -19,29 +18,30 @@ if TYPE_CHECKING:
 
 
 class Logger(Protocol):
-    """One run's listener, made when the run begins or is resumed."""
+    """Logger of one run, created when the run starts or resumes."""
 
     def log(self, values: Mapping[str, float], step: int) -> None:
-        """Take the numbers of a step; they are named as in ``metrics.jsonl``."""
+        """Log the numbers of a step, named as in ``metrics.jsonl``."""
         ...
 
     def finish(self, result: Result, folder: Path) -> None:
-        """Take the finished run: its pictures, mesh and page lie in ``folder``."""
+        """Log the finished run; its pictures, mesh and page are in ``folder``."""
         ...
 
     def close(self, status: str) -> None:
-        """The run has ended: "done", "interrupted" or "failed". Called once, whatever happened."""
+        """End the log. ``status`` is "done", "interrupted" or "failed". Always called exactly
+        once."""
         ...
 
 
 class Loggers:
-    """All loggers of a run, as a context. An exception of theirs is a warning, and the end of that
-    logger."""
+    """All loggers of a run, as a context manager. A logger that raises is dropped with a
+    warning."""
 
     def __init__(self, config: Config, folder: Path, record: Mapping[str, Any], step: int):
-        """``step`` is the one that the run goes on from; later ones will be told again.
+        """``step`` is the step that the run continues from; later steps are logged again.
 
-        Raises `UserError` for a logger that can't begin: nothing has been computed yet.
+        Raises `UserError` if a logger can't start; nothing has been computed yet.
         """
         from styleexp import plugins
 
@@ -53,12 +53,12 @@ class Loggers:
             self._loggers[name] = built
 
     def step(self, step: Step) -> None:
-        """Tell what a step measured."""
+        """Log a step's measurements."""
         values = {key: value for key, value in asdict(step).items() if key != "step"}
         self._each(lambda logger: logger.log(values, step.step))
 
     def finish(self, result: Result, folder: Path, metrics: Mapping[str, float], step: int) -> None:
-        """Tell what came out; ``metrics`` are those of ``metrics.json``, named ``final/…``."""
+        """Log the result; ``metrics`` are those of ``metrics.json``, logged as ``final/…``."""
         final = {f"final/{k}": float(v) for k, v in metrics.items() if isinstance(v, int | float)}
         self._each(lambda logger: logger.log(final, step))
         self._each(lambda logger: logger.finish(result, folder))
@@ -80,7 +80,7 @@ class Loggers:
                 del self._loggers[name]
                 told = " ".join(str(error).split()) or type(error).__name__
                 warnings.warn(
-                    f"the logger '{name}' stopped ({told}); the run goes on, metrics.jsonl has it "
-                    "all.",
+                    f"the logger '{name}' failed ({told}); the run continues, and metrics.jsonl "
+                    "is complete.",
                     stacklevel=2,
                 )

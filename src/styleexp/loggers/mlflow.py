@@ -17,7 +17,7 @@ from filelock import FileLock
 from styleexp import atomic
 from styleexp.errors import UserError
 
-# Read when MLflow is imported: it would send usage data.
+# Read when MLflow is imported; disables usage tracking.
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
 
 from mlflow import MlflowClient
@@ -31,19 +31,19 @@ if TYPE_CHECKING:
 
 SQLITE = "sqlite:///"
 KEPT = "mlflow.json"
-"""In the run's folder: which of MLflow's runs it is."""
+"""File in the run's folder that holds the MLflow run ID."""
 FILES = ("run.json", "metrics.json", "preview.png", "result.glb", "report.html")
-"""What is saved beside the numbers, where the run has it."""
+"""Files that are logged as artifacts, if they exist."""
 BATCH = 25
-"""Steps that are told together: a transaction each would take as long as a small step."""
+"""Steps per batch; one transaction per step would take as long as a small step."""
 STATUS = {"done": "FINISHED", "interrupted": "KILLED", "failed": "FAILED"}
 
 
 class MLflow:
-    """A run of MLflow's, which a resumed run goes on with."""
+    """An MLflow run, which a resumed run continues."""
 
     def __init__(self, config: MLflowConfig, folder: Path, record: Mapping[str, Any], step: int):
-        for noisy in ("alembic", "mlflow"):  # the store's set-up, on the terminal
+        for noisy in ("alembic", "mlflow"):  # hide the store's set-up messages
             logging.getLogger(noisy).setLevel(logging.WARNING)
         kept = folder / KEPT
         before = json.loads(kept.read_text("utf-8")) if step and kept.is_file() else None
@@ -59,7 +59,7 @@ class MLflow:
         except (MlflowException, SQLAlchemyError, OSError) as error:
             told = " ".join(str(error).split())[:200]
             raise UserError(
-                f"MLflow's store '{uri}' can't be used ({told}): give another one with "
+                f"the MLflow store '{uri}' can't be used ({told}): choose another one with "
                 "logger.mlflow.uri=URI."
             ) from error
         atomic.write(kept, atomic.text(json.dumps({"uri": uri, "run_id": self._run}) + "\n"))
@@ -89,12 +89,12 @@ class MLflow:
         self._client.log_batch(self._run, tags=made)
 
     def _last_step(self) -> int:
-        """MLflow forgets nothing, so the steps that it knows are not told again."""
+        """Last logged step. MLflow can't delete steps, so known ones aren't logged again."""
         history = self._client.get_metric_history(self._run, "loss")
         return max((each.step for each in history), default=0)
 
     def log(self, values: Mapping[str, float], step: int) -> None:
-        """One metric for each number."""
+        """Log one metric per number."""
         if "loss" in values and step <= self._told:
             return
         now = int(time.time() * 1000)
@@ -109,7 +109,7 @@ class MLflow:
         self._waiting = []
 
     def finish(self, result: Result, folder: Path) -> None:
-        """The result and what shows it, as files."""
+        """Log the result and its pictures as artifacts."""
         for name in FILES:
             if (folder / name).is_file():
                 self._client.log_artifact(self._run, str(folder / name))
@@ -121,7 +121,7 @@ class MLflow:
 
 
 def _absolute(uri: str) -> str:
-    """A local file's, wherever the run is resumed from."""
+    """Make a local file's URI absolute, so that the run can be resumed from any folder."""
     if not uri.startswith(SQLITE):
         return uri
     return f"{SQLITE}{Path(uri.removeprefix(SQLITE)).absolute()}"
@@ -129,8 +129,8 @@ def _absolute(uri: str) -> str:
 
 @contextmanager
 def _alone(uri: str) -> Iterator[str | None]:
-    """The place for files of a store that is a local file, which nobody else opens meanwhile: jobs
-    of a sweep begin at once, and only one of them may create its tables."""
+    """Yield the artifact location of a local store, while holding its lock: jobs of a sweep start
+    together, and only one of them may create the tables."""
     if not uri.startswith(SQLITE):
         yield None
         return

@@ -15,11 +15,12 @@ if TYPE_CHECKING:
 
 @dataclass
 class TensorBoardConfig:
-    """Event files in the run's folder ``tensorboard``: ``tensorboard --logdir outputs``."""
+    """Event files in the run's subfolder ``tensorboard``; view with ``tensorboard --logdir
+    outputs``."""
 
     name: str = "tensorboard"
     mesh: bool = True
-    """Source and result as meshes that can be turned: about 0.8 MB for 20 000 faces."""
+    """Log source and result as interactive meshes: about 0.8 MB for 20 000 faces."""
 
 
 @dataclass
@@ -28,9 +29,9 @@ class MLflowConfig:
 
     name: str = "mlflow"
     uri: str = "sqlite:///outputs/mlflow.db"
-    """Of the tracking store. ``sqlite:///FILE`` is a file here, created if need be, with the saved
-    files in the folder ``mlflow-files`` beside it; anything else is MLflow's, a server's
-    ``http://…`` for example."""
+    """URI of the tracking store. ``sqlite:///FILE`` is a local file, created if needed, with
+    artifacts in the folder ``mlflow-files`` next to it. Any other URI is passed to MLflow, such as
+    a server's ``http://…``."""
     experiment: str = "styleexp"
 
 
@@ -51,7 +52,7 @@ def _mlflow(config: MLflowConfig, *, folder: Path, record: Mapping[str, Any], st
 LOGGERS = {
     "tensorboard": Spec(
         "tensorboard",
-        "scalars, pictures and meshes as TensorBoard's event files",
+        "scalars, pictures and meshes as TensorBoard event files",
         TensorBoardConfig,
         _tensorboard,
         requires=("tensorboard",),

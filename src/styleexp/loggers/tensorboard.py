@@ -15,12 +15,12 @@ if TYPE_CHECKING:
     from styleexp.stylize import Result
 
 FOLDER = "tensorboard"
-"""Below the run's."""
+"""Subfolder of the run's folder."""
 GREY = 190
 
 
 class TensorBoard:
-    """Event files. What an interrupted run wrote after its checkpoint is purged by its readers."""
+    """Writes event files. TensorBoard purges what an interrupted run wrote after its checkpoint."""
 
     def __init__(
         self, config: TensorBoardConfig, folder: Path, record: Mapping[str, Any], step: int
@@ -33,13 +33,13 @@ class TensorBoard:
             self._writer.add_text("run", f"```json\n{told}\n```", 0)
 
     def log(self, values: Mapping[str, float], step: int) -> None:
-        """One scalar for each number."""
+        """Log one scalar per number."""
         self._step = step
         for key, value in values.items():
             self._writer.add_scalar(key, value, step)
 
     def finish(self, result: Result, folder: Path) -> None:
-        """The preview, and source and result as meshes, in the source's own frame."""
+        """Log the preview, and source and result as meshes in the source's own frame."""
         from PIL import Image
 
         with Image.open(folder / "preview.png") as opened:
@@ -55,5 +55,5 @@ class TensorBoard:
             self._writer.add_mesh(name, shape, colors, faces, global_step=self._step)
 
     def close(self, status: str) -> None:
-        """Flush."""
+        """Close the event files."""
         self._writer.close()

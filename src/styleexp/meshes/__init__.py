@@ -1,19 +1,19 @@
 """Meshes: load, check, repair, normalise, remesh, and save in the input's own frame.
 
-A file and an optimiser want different things of a mesh. The optimiser wants one vertex per point of
-the surface, so that a displacement cannot tear it open; a file keeps several wherever a texture,
-an edge or a colour has a seam. `load_mesh` welds by position and remembers the file's own rows and
-all else that it holds in a `Carrier`; `save_mesh` puts moved vertices back into them::
+Files and optimisers need different representations. The optimiser needs one vertex per surface
+point, so that a displacement can't tear the surface; files duplicate vertices at texture, normal
+and colour seams. `load_mesh` welds by position and keeps the file's own rows and everything else in
+a `Carrier`; `save_mesh` writes moved vertices back into them::
 
     file rows (position, uv, normal, colour)  ── weld ──►  Mesh.vertices  ── optimise ──┐
               ▲                                                                         │
               └─────────────────────────── un-weld (Carrier.rows) ◄─────────────────────┘
 
-glTF (`gltf`, `gltf_writing`), PLY (`ply`, `ply_meshes`) and OBJ (`obj`) are read and written here,
-as no library gives back all that a file has; STL and OFF are read by trimesh.
+glTF (`gltf`, `gltf_writing`), PLY (`ply`, `ply_meshes`) and OBJ (`obj`) have their own readers and
+writers here, because no library preserves everything in a file; STL and OFF are read with trimesh.
 
-Coordinates are float64 in the file's frame and scale, a glTF scene's in its world frame. Faces wind
-counter-clockwise seen from outside.
+Coordinates are float64 in the file's frame and scale; for glTF, in the scene's world frame. Faces
+wind counter-clockwise seen from outside.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     MeshLike: TypeAlias = str | Path | Mesh | trimesh.Trimesh | tuple[np.ndarray, np.ndarray]
     """A name, a file, or a mesh in memory: see `styleexp.stylize`."""
 
-# These need trimesh, which is loaded when the first of them is used.
+# These import trimesh, lazily.
 _HOMES = {
     "from_arrays": "memory",
     "from_memory": "memory",

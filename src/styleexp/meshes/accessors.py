@@ -1,4 +1,4 @@
-"""Numbers of a glTF file: its accessors, whatever their types, strides and sparse parts."""
+"""Read glTF accessors of any type, stride and sparsity."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from styleexp.errors import UserError
 
 MOST_ZEROS = 10_000_000
-"""Elements that a glTF file may call for without holding them."""
+"""Maximum number of elements that a glTF file may declare without storing them."""
 DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 SHAPES = {
     "SCALAR": (1, 1),
@@ -20,13 +20,13 @@ SHAPES = {
     "MAT3": (3, 3),
     "MAT4": (4, 4),
 }
-"""Columns and rows; glTF stores matrices by columns."""
+"""Columns and rows per element type; glTF stores matrices column-major."""
 
 
 def item(tree: dict[str, Any], kind: str, index: Any) -> dict[str, Any]:
-    """An object of one of the document's lists. Raises `UserError` where there is none."""
+    """An entry of one of the document's lists. Raises `UserError` if there is none."""
     found = tree.get(kind, [])
-    # In Python True is 1, and -1 the last: neither is an index in glTF.
+    # Python accepts True and -1 as indices; glTF doesn't.
     if type(index) is not int or not 0 <= index < len(found):
         raise UserError(
             f"refers to {kind}[{index}], but has {len(found)} {kind}: export the mesh again."
@@ -35,10 +35,10 @@ def item(tree: dict[str, Any], kind: str, index: Any) -> dict[str, Any]:
 
 
 def read(tree: dict[str, Any], buffers: list[bytes], index: Any) -> np.ndarray:
-    """An accessor's elements as they are stored, (count, components), sparse ones put in.
+    """An accessor's elements as stored, (count, components), with sparse values applied.
 
-    Matrices come as one row of their entries, column by column. Raises `UserError`, the end of a
-    sentence that begins with the file's name, where the file does not hold what it promises.
+    Matrices become one row of entries, column-major. If the file lacks promised data, raises
+    `UserError` with a message that lacks its subject, the file's name.
     """
     accessor = item(tree, "accessors", index)
     dtype, shape, count = _layout(accessor, index)
@@ -46,7 +46,7 @@ def read(tree: dict[str, Any], buffers: list[bytes], index: Any) -> np.ndarray:
         start = accessor.get("byteOffset", 0)
         values = _view(tree, buffers, accessor["bufferView"], start, dtype, shape, count)
     elif count > MOST_ZEROS:
-        raise UserError(f"promises {count} values that it does not hold: export it again.")
+        raise UserError(f"promises {count} values that it does not contain: export it again.")
     else:
         values = np.zeros((count, shape[0] * shape[1]), dtype)
     sparse = accessor.get("sparse")
@@ -56,7 +56,7 @@ def read(tree: dict[str, Any], buffers: list[bytes], index: Any) -> np.ndarray:
     where, what = sparse["indices"], sparse["values"]
     kind = DTYPES.get(where["componentType"])
     if kind not in ("<u1", "<u2", "<u4"):
-        raise UserError("has sparse indices that are no unsigned integers: export the mesh again.")
+        raise UserError("has sparse indices that are not unsigned integers: export the mesh again.")
     at = _view(tree, buffers, where["bufferView"], where.get("byteOffset", 0), np.dtype(kind),
                (1, 1), number, packed=True)[:, 0].astype(np.int64)  # fmt: skip
     if number and at.max() >= count:
@@ -67,7 +67,7 @@ def read(tree: dict[str, Any], buffers: list[bytes], index: Any) -> np.ndarray:
 
 
 def real(tree: dict[str, Any], buffers: list[bytes], index: Any) -> np.ndarray:
-    """The same as the numbers that they stand for, float64: normalised integers as fractions."""
+    """An accessor's elements as float64, with normalised integers converted to fractions."""
     values = read(tree, buffers, index)
     fractions = values.dtype.kind != "f" and item(tree, "accessors", index).get("normalized", False)
     return fraction(values) if fractions else values.astype(np.float64)
@@ -79,7 +79,7 @@ def fraction(values: np.ndarray) -> np.ndarray:
 
 
 def count_of(tree: dict[str, Any], index: Any) -> int:
-    """An accessor's number of elements, as the file says."""
+    """An accessor's declared number of elements."""
     return _layout(item(tree, "accessors", index), index)[2]
 
 
@@ -103,13 +103,13 @@ def _view(
     count: int,
     packed: bool = False,
 ) -> np.ndarray:
-    """``count`` elements of a buffer view, ``start`` bytes into it, as an array of their own."""
+    """Copy ``count`` elements from a buffer view, at byte offset ``start``."""
     view = item(tree, "bufferViews", index)
     item(tree, "buffers", view["buffer"])
     columns, rows = shape
-    # The columns of a matrix begin at multiples of four bytes.
+    # Matrix columns are aligned to four bytes.
     column = rows * dtype.itemsize if columns == 1 else -(-rows * dtype.itemsize // 4) * 4
-    # Some write a stride of 0 for elements that lie side by side.
+    # Some exporters write stride 0 for tightly packed elements.
     stride = (0 if packed else view.get("byteStride", 0)) or columns * column
     what = f"bufferViews[{index}]"
     offset, start = _whole(view.get("byteOffset", 0), what), _whole(start, what)
@@ -118,7 +118,7 @@ def _view(
     end = start + (stride * (count - 1) + size if count else 0)
     if stride < size or end > length or offset + length > len(buffers[view["buffer"]]):
         raise UserError(
-            f"promises more in {what} than it holds: copy or export the mesh again, with its "
+            f"promises more in {what} than it contains: copy or export the mesh again, with its "
             "buffers."
         )
     if count == 0:

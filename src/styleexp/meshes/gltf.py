@@ -1,11 +1,10 @@
-"""glTF files: the document as it came, and the surfaces that its scene shows.
+"""glTF files: the original document, and the surfaces that its scene shows.
 
-The document is plain JSON, so that what this package knows nothing of (extensions, extras, fields
-of later versions) comes back as it was. `styleexp.meshes.gltf_writing` puts a changed surface into
-it.
+The document is kept as plain JSON, so that unknown content (extensions, extras, fields of later
+versions) survives unchanged. `styleexp.meshes.gltf_writing` writes a changed surface into it.
 
-A surface is read in world space, as a viewer shows the file before any animation: nodes' transforms
-are applied, to a skinned mesh its joints' instead, and morph targets by their given weights.
+Surfaces are read in world space, as a viewer shows the file without animation: with node transforms
+(joint transforms for skinned meshes) and morph targets at their default weights.
 """
 
 from __future__ import annotations
@@ -31,48 +30,48 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 DISPLACEMENT = "_DISPLACEMENT"
-"""The custom attribute of a result, which the next run's result has anew."""
+"""Custom attribute of a result; a next run overwrites it."""
 TRIANGLES, STRIP, FAN = 4, 5, 6
 EARLY = "ends too early: copy or export the mesh again."
 DRACO = "KHR_draco_mesh_compression"
 UNDO = {
     DRACO: "for example with 'npx @gltf-transform/cli copy in.glb out.glb'",
     "EXT_meshopt_compression": "for example with 'npx @gltf-transform/cli copy in.glb out.glb'",
-    "EXT_mesh_gpu_instancing": "with each copy a node of its own",
+    "EXT_mesh_gpu_instancing": "with a separate node for each copy",
 }
-"""How to do without an extension that is not read."""
+"""How to remove an unsupported extension from a file."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """Rows of one node's mesh: its primitives that have the same attributes, as they share them."""
+    """Rows of one node's mesh, for all primitives that share the same attributes."""
 
     node: int
     mesh: int
     primitives: tuple[int, ...]
     attributes: dict[str, int]
     used: Int[np.ndarray, " rows"]
-    """The attributes' elements that are the rows; no face uses the others."""
+    """Elements of the attributes that faces use; these are the rows."""
     matrix: Float[np.ndarray, "*rows 4 4"]
-    """From the mesh's own frame into the world; a skinned mesh has one for each row."""
+    """Transform from the mesh's own frame to the world; per row for a skinned mesh."""
     morph: Float[np.ndarray, "rows 3"] | float = 0.0
-    """What the morph targets add to each row, in the mesh's own frame."""
+    """Offset of each row by morph targets, in the mesh's own frame."""
 
 
 @dataclass(frozen=True)
 class Document:
-    """A glTF file: its JSON, its buffers' content, and which rows came from where."""
+    """A glTF file: its JSON, its buffers, and the origin of each row."""
 
     tree: dict[str, Any]
     buffers: list[bytes]
     blocks: tuple[Block, ...] = ()
-    """In the order of `Carrier.rows`."""
+    """Blocks in the order of `Carrier.rows`."""
     images: dict[int, bytes | None] | None = None
-    """Images of files beside it; None where it may not be had."""
+    """Contents of external image files; None for those that can't be read."""
 
 
 def parse(kind: str, data: bytes) -> tuple[dict[str, Any], bytes]:
-    """The JSON of a glTF file and, of a GLB, its binary chunk."""
+    """The JSON of a glTF file and, for a GLB, its binary chunk."""
     text, binary = data, b""
     if kind == "glb":
         if data[:4] != b"glTF":
@@ -92,27 +91,27 @@ def parse(kind: str, data: bytes) -> tuple[dict[str, Any], bytes]:
         tree = json.loads(text, parse_constant=_no_number, parse_float=_finite)
     except (ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())[:80]
-        raise UserError(f"is not whole JSON ({reason}): copy or export the mesh again.") from None
+        raise UserError(f"is not valid JSON ({reason}): copy or export the mesh again.") from None
     if not isinstance(tree, dict):
-        raise UserError("is JSON, but no glTF: export the mesh again.")
+        raise UserError("is JSON, but not glTF: export the mesh again.")
     return tree, binary
 
 
 def read_gltf(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
-    """The rows' positions (rows, 3) in world space, all else, and notes."""
+    """Read the rows' positions (rows, 3) in world space, the carrier, and notes."""
     tree, binary = parse(path.suffix.lower()[1:], data)
     _check_extensions(tree)
     beside = Beside(path)
     buffers = [_buffer(b, k, binary, beside) for k, b in enumerate(tree.get("buffers", ()))]
     zeros = sum(a["count"] for a in tree.get("accessors", ()) if "bufferView" not in a)
     if zeros > MOST_ZEROS:
-        raise UserError(f"promises {zeros} values that it does not hold: export it again.")
+        raise UserError(f"promises {zeros} values that it does not contain: export it again.")
     notes: list[str] = []
     world, parent, shown = gltf_nodes.world(tree)
     _check_size(tree, shown, MOST_ZEROS + len(data) + sum(map(len, buffers)))
     reader = _Reader(tree, buffers)
     materials = Materials(tree, buffers, beside, notes)
-    # Not in the order of meshes, which is another once nodes that shared one differ.
+    # Not in mesh order, which changes once nodes that shared a mesh differ.
     for node, name in zip(shown, gltf_nodes.names(tree, parent, shown), strict=True):
         reader.node(node, name, world)
     if not reader.blocks:
@@ -131,13 +130,13 @@ class _Reader:
         self.blocks: list[Block] = []
         self.columns: list[dict[str, np.ndarray]] = []
         self.faces: list[np.ndarray] = []
-        self.labels: list[tuple[int, int, int]] = []  # part, material, faces, of each primitive
+        self.labels: list[tuple[int, int, int]] = []  # part, material and faces of each primitive
         self.parts: dict[str, int] = {}
-        self.loose = np.zeros((0, 3))  # positions without a face, if all are
+        self.loose = np.zeros((0, 3))  # positions, if there are no faces at all
         self.rows = self.unused = self.odd = self.flat = 0
 
     def node(self, index: int, name: str, world: np.ndarray) -> None:
-        """The surfaces of one node."""
+        """Collect the surfaces of one node."""
         node = self.tree["nodes"][index]
         mesh = item(self.tree, "meshes", node["mesh"])
         extensions = node.get("extensions", {})
@@ -199,7 +198,7 @@ class _Reader:
                 columns[name] = values
         if "normals" in columns:
             columns["normals"] = turned(np.linalg.pinv(matrix[..., :3, :3]), columns["normals"])
-        # A mirrored node winds the other way (glTF 2.0, 3.7.4).
+        # A mirrored node reverses the winding (glTF 2.0, 3.7.4).
         mirrored = np.broadcast_to(determinants < 0, len(used))
         numbers = np.where(mirrored[numbers[:, :1] - self.rows], numbers[:, ::-1], numbers)
         self.faces.append(numbers)
@@ -228,12 +227,13 @@ class _Reader:
         return self._column(index, accessors.count_of(self.tree, index), 3)
 
     def _faces(self, primitive: dict[str, Any], count: int) -> np.ndarray:
-        """Triangles (faces, 3), of strips and fans, too, as they wind (glTF 2.0, 3.7.2.1)."""
+        """Triangles (faces, 3), also from strips and fans, with correct winding (glTF 2.0,
+        3.7.2.1)."""
         order = np.arange(count)
         if "indices" in primitive:
             stored = accessors.read(self.tree, self.buffers, primitive["indices"])
             if stored.shape[1] != 1 or stored.dtype.kind != "u":
-                raise UserError("has indices that are no unsigned integers: export it again.")
+                raise UserError("has indices that are not unsigned integers: export it again.")
             order = stored[:, 0].astype(np.int64)
         mode = primitive.get("mode", TRIANGLES)
         if mode == TRIANGLES:
@@ -248,7 +248,7 @@ class _Reader:
                 faces = order[np.stack([k + 1, k + 2, 0 * k], axis=1)]
             else:
                 faces = order[np.stack([k, k + 1 + k % 2, k + 2 - k % 2], axis=1)]
-                # Repeated indices lead a strip to where it goes on.
+                # Repeated indices join separate strips.
                 faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
         check_indices(faces, count)
         return faces
@@ -264,16 +264,16 @@ class _Reader:
         return moved
 
     def told(self) -> list[str]:
-        """One sentence for each thing that is not part of the surface."""
+        """Notes on everything that isn't part of the surface."""
         notes = []
         if self.odd:
             number = plural(self.odd, "primitive", "primitives")
-            notes.append(f"left {number} of points or lines as they were (in a GLB)")
+            notes.append(f"left {number} of points or lines unchanged (GLB only)")
         if self.unused:
             number = plural(self.unused, "vertex", "vertices")
             notes.append(f"left out {number} that no face uses")
         if self.flat:
-            notes.append("has a node without extent in some direction: nothing can move along it")
+            notes.append("has a node with zero scale along an axis: nothing can move along it")
         return notes
 
     def points(self) -> np.ndarray:
@@ -281,7 +281,7 @@ class _Reader:
         return np.concatenate([columns["points"] for columns in self.columns])
 
     def carrier(self, materials: Materials) -> Carrier:
-        """All else of the rows."""
+        """Everything else about the rows, as a `Carrier`."""
         corners = np.concatenate(self.faces)
         uv = self._joined("uv", np.zeros(2))
         if uv is not None:
@@ -308,8 +308,8 @@ class _Reader:
         )
 
     def _attributes(self) -> dict[str, np.ndarray]:
-        """The columns of custom attributes, 0 where a block lacks one; not those whose width is
-        another from block to block."""
+        """Custom attributes, 0 where a block lacks one; without those whose width differs between
+        blocks."""
         widths: dict[str, set[int]] = {}
         for columns in self.columns:
             for name in filter(lambda name: name.startswith("_"), columns):
@@ -322,7 +322,7 @@ class _Reader:
         return found
 
     def _joined(self, name: str, filler: np.ndarray) -> np.ndarray | None:
-        """A column of all rows, filled where a block has none; None if no block has it."""
+        """One attribute for all rows, filled where a block lacks it; None if no block has it."""
         if not any(name in columns for columns in self.columns):
             return None
         return np.concatenate(
@@ -334,17 +334,17 @@ class _Reader:
 
 
 def transformed(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Points (n, 3) by one matrix (4, 4), or each by its own (n, 4, 4)."""
+    """Transform points (n, 3) by one matrix (4, 4), or one per point (n, 4, 4)."""
     return turned(matrix[..., :3, :3].swapaxes(-1, -2), points) + matrix[..., :3, 3]
 
 
 def turned(matrix: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Row vectors (n, 3) times one matrix (3, 3), or each times its own (n, 3, 3)."""
+    """Multiply row vectors (n, 3) by one matrix (3, 3), or one per vector (n, 3, 3)."""
     return np.einsum("...i,...ij->...j", directions, matrix)
 
 
 def base_uv(tree: dict[str, Any], primitive: dict[str, Any]) -> int:
-    """Which set of texture coordinates the base colour's texture uses; 0 where there is none."""
+    """Index of the texture coordinates that the base colour texture uses; 0 if it has none."""
     if "material" not in primitive:
         return 0
     material = item(tree, "materials", primitive["material"])
@@ -357,7 +357,7 @@ def _morphs(primitive: dict[str, Any]) -> str:
 
 
 def _stale(tree: dict[str, Any], blocks: list[Block]) -> list[str]:
-    """One note on what stays as it was made for the mesh as it was."""
+    """A note on content that was made for the original mesh and is kept unchanged."""
     shown = [tree["meshes"][b.mesh]["primitives"][b.primitives[0]] for b in blocks]
     found = {
         "morph targets": any(p.get("targets") for p in shown),
@@ -368,11 +368,11 @@ def _stale(tree: dict[str, Any], blocks: list[Block]) -> list[str]:
     if not names:
         return []
     joined = " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
-    return [f"kept {joined} in the GLB as made for the mesh before it was changed: check them"]
+    return [f"kept {joined} in the GLB, made for the unchanged mesh: check them"]
 
 
 def _check_size(tree: dict[str, Any], shown: list[int], most: int) -> None:
-    """A small file may show the same numbers a million times."""
+    """Limit instancing: a small file may show the same data a million times."""
     sizes: dict[int, int] = {}
     for node in shown:
         mesh = tree["nodes"][node]["mesh"]
@@ -384,10 +384,7 @@ def _check_size(tree: dict[str, Any], shown: list[int], most: int) -> None:
                     sizes[mesh] += 0 if index is None else accessors.count_of(tree, index)
         most -= sizes[mesh]
         if most < 0:
-            raise UserError(
-                "shows its meshes so often that they make many times the numbers that it holds: "
-                "export fewer copies."
-            )
+            raise UserError("instances its meshes too often for its size: export fewer copies.")
 
 
 def _check_extensions(tree: dict[str, Any]) -> None:
@@ -399,7 +396,7 @@ def _check_extensions(tree: dict[str, Any]) -> None:
 def _unread(name: str) -> UserError:
     how = UNDO.get(name, "export the mesh without it")
     how = f"undo it, {how}" if name in UNDO else how
-    return UserError(f"needs the glTF extension {name}, which is not read: {how}.")
+    return UserError(f"needs the glTF extension {name}, which is not supported: {how}.")
 
 
 def _buffer(buffer: dict[str, Any], index: int, binary: bytes, beside: Beside) -> bytes:
@@ -413,10 +410,10 @@ def _buffer(buffer: dict[str, Any], index: int, binary: bytes, beside: Beside) -
 
 
 def _no_number(word: str) -> float:
-    raise ValueError(f"{word} is no number in JSON")
+    raise ValueError(f"{word} is not a JSON number")
 
 
 def _finite(word: str) -> float:
     if not math.isfinite(float(word)):
-        raise ValueError(f"{word[:20]} is beyond any number")
+        raise ValueError(f"{word[:20]} is out of range")
     return float(word)

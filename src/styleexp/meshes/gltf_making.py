@@ -1,4 +1,4 @@
-"""A new GLB of a mesh that did not come from one."""
+"""Write a new GLB for a mesh that was not loaded from glTF."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from styleexp.meshes.mesh import Carrier
 KINDS = {"u1": 5121, "u2": 5123, "u4": 5125, "f4": 5126}
 TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 VERTEX, INDEX = 34962, 34963
-"""What a buffer view is for."""
+"""Buffer view targets."""
 
 
 def new_glb(
@@ -24,10 +24,10 @@ def new_glb(
     normals: np.ndarray,
     displacement: np.ndarray | None,
 ) -> bytes:
-    """A node for each part with one mesh, in it a primitive for each material.
+    """Make a GLB with one node and mesh per part, and one primitive per material.
 
     ``runs`` are part, material (-1 for none) and faces. ``points`` (rows, 3), unit ``normals``
-    (rows, 3) and ``displacement`` (rows,), which becomes ``_DISPLACEMENT``, are of the rows.
+    (rows, 3) and ``displacement`` (rows,), written as ``_DISPLACEMENT``, are per row.
     """
     pieces: dict[int, dict[int, list[np.ndarray]]] = {}
     for part, material, run in runs:
@@ -37,7 +37,7 @@ def new_glb(
     for material in used:
         file.material(carrier.materials[material], textured=carrier.uv is not None)
     if carrier.uv is not None and any(material < 0 for _, material, _ in runs):
-        used[-1] = file.plain_material()  # some readers drop coordinates where there is none
+        used[-1] = file.plain_material()  # without a material, some readers drop the UVs
     for part, by_material in pieces.items():
         primitives = []
         for material, faces in by_material.items():
@@ -51,7 +51,7 @@ def new_glb(
             attributes = {name: file.floats(name, values) for name, values in columns.items()}
             if colors is not None:
                 attributes["COLOR_0"] = file.accessor(colors, VERTEX, normalized=True)
-            small = len(rows) < 65535  # of which the last is not an index
+            small = len(rows) < 65535  # 65535 is not a valid index
             indices = corners.reshape(-1, 1).astype(np.uint16 if small else np.uint32)
             primitive = {"attributes": attributes, "indices": file.accessor(indices, INDEX)}
             if material in used:
@@ -62,7 +62,7 @@ def new_glb(
 
 
 def _own(carrier: Carrier) -> dict[str, np.ndarray]:
-    """The vertices' own numbers and vectors, under names that glTF allows."""
+    """Custom vertex attributes, renamed to be valid in glTF."""
     return {
         "_" + re.sub(r"\W", "_", name).upper(): values
         for name, values in carrier.attributes.items()
@@ -71,9 +71,9 @@ def _own(carrier: Carrier) -> dict[str, np.ndarray]:
 
 
 def _rows(carrier: Carrier, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, Any]:
-    """The rows that some faces need, the faces in them, and the rows' colours, if any.
+    """The rows used by some faces, the faces indexed into them, and the rows' colours, if any.
 
-    glTF has no colours of faces: there a row is one for each colour around it.
+    glTF has no face colours, so rows are duplicated for each adjacent colour.
     """
     corners = carrier.corners[faces]
     if carrier.colors is not None or carrier.face_colors is None:
@@ -109,7 +109,7 @@ class _File:
         return self._add("bufferViews", entry)
 
     def accessor(self, values: np.ndarray, target: int, **more: Any) -> int:
-        """Its number; ``values`` (count, components)."""
+        """Add an accessor for ``values`` (count, components); return its index."""
         kind = values.dtype.str[1:]
         entry = {
             "bufferView": self._view(values.astype(f"<{kind}").tobytes(), target=target),
@@ -120,7 +120,7 @@ class _File:
         return self._add("accessors", entry | more)
 
     def floats(self, name: str, values: np.ndarray) -> int:
-        """The accessor of an attribute of floats; positions need their bounds."""
+        """Add a float attribute's accessor; positions also get bounds."""
         values = values.reshape(len(values), -1).astype(np.float32)
         bounds = {}
         if name == "POSITION":
@@ -129,12 +129,12 @@ class _File:
         return self.accessor(values, VERTEX, **bounds)
 
     def node(self, name: str, primitives: list[dict[str, Any]]) -> None:
-        """A node with a mesh, both of that name."""
+        """Add a node with a mesh, both with this name."""
         mesh = self._add("meshes", {"name": name, "primitives": primitives})
         self.tree["scenes"][0]["nodes"].append(self._add("nodes", {"name": name, "mesh": mesh}))
 
     def material(self, material: Any, textured: bool) -> None:
-        """One of trimesh's, as far as there are texture coordinates for its texture."""
+        """Add a trimesh material, with its texture if there are texture coordinates."""
         surface: dict[str, Any] = {}
         if material.baseColorFactor is not None:
             surface["baseColorFactor"] = (np.asarray(material.baseColorFactor) / 255).tolist()
@@ -151,7 +151,7 @@ class _File:
         self._add("materials", entry)
 
     def plain_material(self) -> int:
-        """One that looks like none."""
+        """Add a material that looks like no material."""
         return self._add("materials", {"name": "material"})
 
     def _texture(self, image: Any) -> int:
@@ -169,6 +169,6 @@ class _File:
         return self.images[id(image)]
 
     def glb(self) -> bytes:
-        """The file."""
+        """The content of the GLB file."""
         self.tree["buffers"] = [{"byteLength": len(self.binary)}]
         return container(self.tree, bytes(self.binary))

@@ -1,4 +1,4 @@
-"""A glTF file's materials, as far as other formats can hold them, and its images."""
+"""A glTF file's images, and its materials as far as other formats support them."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from styleexp.meshes.references import Beside, resolved
 
 
 class Materials:
-    """Reads the images once, when they are asked for; notes what can't be had.
+    """Reads images lazily, once; collects notes on unavailable ones.
 
-    ``beside`` holds what files there are, None for one that may not be had.
+    ``beside`` holds the contents of external files, None for unavailable ones.
     """
 
     def __init__(
@@ -27,12 +27,12 @@ class Materials:
         self.pictures: dict[int, Any] = {}
         for k, image in enumerate(tree.get("images", ())):
             content = self._content(k, image, buffers, folder)
-            # Basis Universal and the like are for graphics cards: kept, not decoded.
+            # GPU formats such as Basis Universal are kept, not decoded.
             if content is None or content.startswith(b"\xabKTX"):
                 continue
             if fault := images.fault(content):
                 self.notes.append(
-                    f"kept the texture {self._label(k, image)} for GLB alone: it {fault}"
+                    f"kept the texture {self._label(k, image)} in GLB only: it {fault}"
                 )
             else:
                 self.pictures[k] = content
@@ -63,7 +63,8 @@ class Materials:
         return content
 
     def chosen(self, number: np.ndarray) -> tuple[tuple[Any, ...], np.ndarray]:
-        """trimesh's materials of the faces' numbers (-1: none), and each face's place in them."""
+        """trimesh materials used by faces' material numbers (-1: none), and each face's index into
+        them."""
         used, place = np.unique(number, return_inverse=True)
         first = int(len(used) > 0 and used[0] < 0)
         return tuple(self._made(int(k)) for k in used[first:]), place.ravel() - first

@@ -1,4 +1,4 @@
-"""Where a glTF file's nodes are in the world, and where joints take a skinned mesh."""
+"""World transforms of a glTF file's nodes, and skinning."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ LOOKS = re.compile(
     r"KHR_materials_\w+|KHR_texture_\w+|EXT_texture_\w+|KHR_lights_punctual"
     r"|KHR_xmp\w*|KHR_animation_pointer|KHR_mesh_quantization"
 )
-"""glTF extensions that a file may require and its surface still be read rightly."""
+"""Required glTF extensions that don't affect the surface and may be ignored."""
 
 
 def world(tree: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """Each node's matrix into the world (nodes, 4, 4), its parent (nodes,), -1 for none, and the
-    scene's nodes that show a mesh, in their order.
+    """Each node's world matrix (nodes, 4, 4), its parent (nodes,), -1 for none, and the scene's
+    nodes with a mesh, in order.
 
-    Raises `UserError` where nodes are no trees, or a transform is none.
+    Raises `UserError` if the nodes don't form trees, or a transform is invalid.
     """
     nodes = tree.get("nodes", [])
     parent = np.full(len(nodes), -1)
@@ -31,28 +31,28 @@ def world(tree: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, list[int]]:
             item(tree, "nodes", child)
             if parent[child] >= 0:
                 raise UserError(
-                    f"has nodes[{child}] below two others, or twice below one: export the mesh "
+                    f"has nodes[{child}] as a child of two nodes, or twice of one: export the mesh "
                     "again."
                 )
             parent[child] = k
     order = [k for k in range(len(nodes)) if parent[k] < 0]
-    for k in order:  # grows: parents come before their children
+    for k in order:  # the list grows; parents come before their children
         order += nodes[k].get("children", ())
     if len(order) < len(nodes):
-        raise UserError("has nodes that are below themselves: export the mesh again.")
+        raise UserError("has a cycle of nodes: export the mesh again.")
     matrices = np.tile(np.eye(4), (len(nodes), 1, 1))
     for k in order:
         matrices[k] = _local(nodes[k], k)
         if parent[k] >= 0:
             matrices[k] = matrices[parent[k]] @ matrices[k]
     if not np.isfinite(matrices).all():
-        raise UserError("has nodes' transforms that are NaN or infinite: export the mesh again.")
+        raise UserError("has node transforms that are NaN or infinite: export the mesh again.")
     if not tree.get("scenes"):
         return matrices, parent, []
     scene = item(tree, "scenes", tree.get("scene", 0))
     seen = list(dict.fromkeys(scene.get("nodes", ())))
     inside = {item(tree, "nodes", k) is not None and k for k in seen}
-    for k in seen:  # grows
+    for k in seen:  # the list grows
         more = [child for child in nodes[k].get("children", ()) if child not in inside]
         inside.update(more)
         seen += more
@@ -60,9 +60,9 @@ def world(tree: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, list[int]]:
 
 
 def names(tree: dict[str, Any], parent: np.ndarray, shown: list[int]) -> list[str]:
-    """Names of the nodes that show a mesh, each that of no other.
+    """Unique names of the nodes with a mesh.
 
-    A mesh of several materials that was once written as a node for each counts as its parent's.
+    A mesh that was split into one node per material gets its parent's name.
     """
     given: dict[int, str] = {}
     taken: dict[str, int] = {}
@@ -91,9 +91,9 @@ def skinning(
     attributes: dict[str, int],
     matrices: np.ndarray,
 ) -> np.ndarray:
-    """Each vertex' matrix into the world, (vertices, 4, 4): its joints', by their weights.
+    """World matrix of each vertex, (vertices, 4, 4): the weighted sum of its joints'.
 
-    The mesh's own node doesn't count (glTF 2.0, 3.7.3.3).
+    The mesh's own node is ignored (glTF 2.0, 3.7.3.3).
     """
     found = item(tree, "skins", skin)
     joints = np.array([k for k in found["joints"] if item(tree, "nodes", k) is not None])
@@ -122,7 +122,7 @@ def skinning(
 
 
 def _local(node: dict[str, Any], index: int) -> np.ndarray:
-    """A node's matrix into its parent's frame."""
+    """A node's matrix to its parent's frame."""
     try:
         if "matrix" in node:
             return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
@@ -138,6 +138,6 @@ def _local(node: dict[str, Any], index: int) -> np.ndarray:
         matrix[:3, 3] = node.get("translation", (0, 0, 0))
     except (TypeError, ValueError):
         raise UserError(
-            f"has a transform in nodes[{index}] that is none: export the mesh again."
+            f"has an invalid transform in nodes[{index}]: export the mesh again."
         ) from None
     return matrix

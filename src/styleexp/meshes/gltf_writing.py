@@ -1,4 +1,4 @@
-"""A changed surface into the glTF document that it came from; all else stays as it was."""
+"""Write a changed surface into its original glTF document, leaving the rest unchanged."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from styleexp.meshes.mesh import Carrier
 from styleexp.meshes.references import bare
 
 DISPLACEMENT = "_DISPLACEMENT"
-"""glTF wants custom attributes to begin with an underscore, and to be in capitals."""
+"""Custom attribute name; glTF requires a leading underscore and capitals."""
 Content = dict[str, np.ndarray]
-"""What becomes of a block: new values of some of its attributes, float32, all elements."""
+"""New values of some of a block's attributes: float32, for all elements."""
 
 
 def glb_of(
@@ -30,16 +30,16 @@ def glb_of(
     normals: np.ndarray,
     displacement: np.ndarray | None,
 ) -> bytes:
-    """A GLB of the carrier's document with its rows at ``points`` (rows, 3), in world space.
+    """Make a GLB of the carrier's document with its rows at ``points`` (rows, 3), in world space.
 
-    Only rows that ``moved`` (rows,) get new positions, only they and their neighbours new normals
-    (rows, 3), so a surface that didn't move is stored bit for bit as it was. Nodes that showed one
-    mesh and now differ get a mesh each. ``displacement`` (rows,) becomes ``_DISPLACEMENT``.
+    Only ``moved`` rows (rows,) get new positions, and only they and their neighbours get new
+    normals (rows, 3), so an unmoved surface is stored bit for bit. Nodes that shared a mesh and now
+    differ get separate meshes. ``displacement`` (rows,) is written as ``_DISPLACEMENT``.
     """
     document: Document = carrier.document
     near = np.zeros(len(points), dtype=bool)
     near[carrier.corners[moved[carrier.corners].any(axis=1)]] = True
-    near = np.isin(carrier.rows, carrier.rows[near])  # rows on a seam go together
+    near = np.isin(carrier.rows, carrier.rows[near])  # include all rows of a seam
     writer = _Writer(document)
     start = 0
     by_node: dict[int, list[tuple[Block, Content]]] = {}
@@ -85,9 +85,9 @@ class _Writer:
     def __init__(self, document: Document) -> None:
         self.original = document.tree
         self.tree = copy.deepcopy(document.tree)
-        self.buffers = [*document.buffers, b""]  # the last is for what is new
+        self.buffers = [*document.buffers, b""]  # the last buffer is for new data
         self.uses = Counter(_references(document.tree))
-        # Extensions unknown here may refer to accessors and views, too.
+        # Unknown extensions may also refer to accessors and views.
         self.known = all(LOOKS.fullmatch(str(x)) for x in document.tree.get("extensionsUsed", ()))
         self.views = Counter(_view_references(document.tree))
         self.absent: set[int] = set()
@@ -95,7 +95,8 @@ class _Writer:
             self._image(index, content)
 
     def put_all(self, by_node: dict[int, list[tuple[Block, Content]]]) -> None:
-        """Every node's new content into its mesh, or into a copy where others keep theirs."""
+        """Store every node's new content in its mesh, or in a copy if other nodes still use the old
+        one."""
         shown: dict[int, list[int]] = {}
         for k, node in enumerate(self.original["nodes"]):
             if "mesh" in node:
@@ -129,7 +130,7 @@ class _Writer:
                 if changed:
                     for name in ("TANGENT", DISPLACEMENT):
                         primitive["attributes"].pop(name, None)
-                    # Draco's copy is of the mesh as it was.
+                    # The Draco copy holds the old mesh.
                     primitive.get("extensions", {}).pop(DRACO, None)
                     if primitive.get("extensions") == {}:
                         del primitive["extensions"]
@@ -142,7 +143,7 @@ class _Writer:
                 del self.tree["extensionsUsed"]
 
     def _accessor(self, values: np.ndarray, old: int | None, bounds: bool) -> int:
-        """A float accessor of ``values`` (count, components), in the place of one given up."""
+        """Add a float accessor of ``values`` (count, components), reusing a freed index."""
         view = None
         if old is not None and "bufferView" in self.original["accessors"][old]:
             view = self.original["accessors"][old]["bufferView"]
@@ -183,8 +184,8 @@ class _Writer:
         return old
 
     def _image(self, index: int, content: bytes | None) -> None:
-        """A file beside the source into the GLB. One that may not be had is a grey pixel that
-        nothing refers to, so that no other image changes its number."""
+        """Embed an external image in the GLB. An unavailable one becomes an unreferenced grey
+        pixel, so that the other images keep their indices."""
         image = self.tree["images"][index]
         image.setdefault("name", bare(image.pop("uri")))
         image.pop("uri", None)
@@ -201,7 +202,7 @@ class _Writer:
         image["mimeType"] = _mime(content) or image.get("mimeType", "image/png")
 
     def glb(self) -> bytes:
-        """The file."""
+        """The content of the GLB file."""
         binary = _packed(self.tree, self.buffers)
         if binary:
             first = {k: v for k, v in (self.tree.get("buffers") or [{}])[0].items() if k != "uri"}
@@ -212,7 +213,7 @@ class _Writer:
 
 
 def container(tree: dict[str, Any], binary: bytes) -> bytes:
-    """A GLB of a document and its one buffer (glTF 2.0, 4)."""
+    """Pack a document and its single buffer as a GLB (glTF 2.0, 4)."""
     text = json.dumps(tree, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
@@ -229,9 +230,9 @@ def _key(blocks: Any) -> Any:
 
 
 def _packed(tree: dict[str, Any], buffers: list[bytes]) -> bytes:
-    """One buffer of all bytes that views refer to, in their order; the views are brought to it.
+    """Merge all bytes that views refer to into one buffer, in order, and update the views.
 
-    What lies side by side or overlaps stays so, and starts keep their place modulo 8.
+    Adjacent or overlapping views stay so, and offsets are preserved modulo 8.
     """
     views = [view for view in tree.get("bufferViews", ()) for view in _spans(view)]
     packed = bytearray()
@@ -259,7 +260,7 @@ def _packed(tree: dict[str, Any], buffers: list[bytes]) -> bytes:
 
 
 def _spans(view: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """A buffer view, and what its extensions refer to in the way of one."""
+    """A buffer view, and view-like objects in its extensions."""
     yield view
     for extension in view.get("extensions", {}).values():
         if isinstance(extension, dict) and {"buffer", "byteLength"} <= extension.keys():
@@ -267,7 +268,7 @@ def _spans(view: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def _references(tree: dict[str, Any]) -> Iterator[int]:
-    """Every use of an accessor that core glTF knows."""
+    """Yield every reference to an accessor in core glTF."""
     for mesh in tree.get("meshes", ()):
         for primitive in mesh.get("primitives", ()):
             yield from primitive.get("attributes", {}).values()
@@ -292,7 +293,7 @@ def _view_references(tree: dict[str, Any]) -> Iterator[int]:
 
 
 def _without(material: Any, textures: set[int]) -> None:
-    """Take out, however deep, what refers to one of some textures."""
+    """Remove, at any depth, references to the given textures."""
     entries = material if isinstance(material, dict) else {}
     for key, value in list(entries.items()):
         lost = isinstance(value, dict) and value.get("index") in textures

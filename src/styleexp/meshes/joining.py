@@ -1,26 +1,28 @@
-"""Vertices that were one before their coordinates were rounded."""
+"""Merge vertices that differ only by rounding."""
 
 from __future__ import annotations
 
 import numpy as np
 
 SHARE = 0.25
-"""Of a vertex' shortest edge: what is nearer may be joined, and no edge can collapse by it."""
+"""Maximum merge distance as a fraction of a vertex's shortest edge, so that no edge can
+collapse."""
 NEIGHBOURS = 32
 
 
 def exact(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The first row of each position, and each row's position, numbered as they first appear."""
+    """First row of each distinct position, and each row's position index, in order of
+    appearance."""
     _, first, inverse = np.unique(points + 0.0, axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)
     return first[order], np.argsort(order)[inverse.ravel()]
 
 
 def near(points: np.ndarray, faces: np.ndarray, distance: float) -> np.ndarray:
-    """For each of distinct points (n, 3) the first of those that it is one with, (n,).
+    """For each of n distinct points (n, 3), the index of the first point it merges with, (n,).
 
-    Only ends of open edges are joined, of sheets that are whole nothing: so a thin part's two sides
-    stay two. Nor is anything joined that is farther than a share of a shortest edge there.
+    Only ends of open edges are merged, never closed surfaces, so the two sides of a thin part stay
+    separate. Points farther apart than a fraction of the local shortest edge are not merged.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -32,7 +34,7 @@ def near(points: np.ndarray, faces: np.ndarray, distance: float) -> np.ndarray:
     if distance <= 0.0 or len(ends) < 2:
         return result
     reach = np.minimum(distance, SHARE * _shortest(points, faces)[ends])
-    # The nearest few, not all pairs: a heap of points would have too many.
+    # Only the nearest few: a dense cluster would have too many pairs.
     k = min(NEIGHBOURS, len(ends))
     apart, other = cKDTree(points[ends]).query(
         points[ends], k=k, distance_upper_bound=distance * (1 + 1e-9)
@@ -43,7 +45,7 @@ def near(points: np.ndarray, faces: np.ndarray, distance: float) -> np.ndarray:
     one, two = ends[one[close]], ends[two[close]]
     graph = coo_matrix((np.ones(len(one), bool), (one, two)), shape=(n, n))
     _, label = connected_components(graph, directed=False)
-    # A chain may have led from one end of an edge to the other.
+    # A chain of merges may connect both ends of an edge.
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     edges = edges[edges[:, 0] != edges[:, 1]]
     collapsed = label[edges[label[edges[:, 0]] == label[edges[:, 1]], 0]]
@@ -53,9 +55,9 @@ def near(points: np.ndarray, faces: np.ndarray, distance: float) -> np.ndarray:
 
 
 def nearly_closed(points: np.ndarray, faces: np.ndarray, distance: float) -> tuple[int, float]:
-    """How many open edges nearly coincide with another, and how far apart such are at most.
+    """Number of open edges that nearly coincide with another one, and their maximum gap.
 
-    Edges count whose ends are within ``distance`` of the other's and that are several times longer.
+    Counts edges whose ends are within ``distance`` of another's and that are several times longer.
     """
     from scipy.spatial import cKDTree
 
@@ -83,7 +85,7 @@ def nearly_closed(points: np.ndarray, faces: np.ndarray, distance: float) -> tup
 
 
 def open_edges(faces: np.ndarray) -> np.ndarray:
-    """Edges of one face only, (edges, 2)."""
+    """Edges with only one face, (edges, 2)."""
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     edges = edges[edges[:, 0] != edges[:, 1]]
     if not len(edges):
@@ -95,7 +97,7 @@ def open_edges(faces: np.ndarray) -> np.ndarray:
 
 
 def _shortest(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Each point's shortest edge, (points,); infinite where it has none."""
+    """Length of each point's shortest edge, (points,); infinite if it has none."""
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     edges = edges[edges[:, 0] != edges[:, 1]]
     length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)

@@ -1,4 +1,4 @@
-"""Meshes and pictures that a program already holds."""
+"""In-memory meshes and images."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 
 
 def from_memory(given: Any, kind: str) -> Mesh | Float[np.ndarray, "height width 3"]:
-    """A `Mesh` of ``(vertices, faces)`` or of a ``trimesh.Trimesh``, or a picture of an array.
+    """Convert ``(vertices, faces)`` or a ``trimesh.Trimesh`` to a `Mesh`, or an array to an image.
 
-    A `Mesh` is returned as it is. Arrays are copied. ``kind`` is what an error calls it: ``source``
-    or ``style``. Raises `UserError` for what is neither, and for what `load_mesh` and
-    `images.load_image` would refuse.
+    A `Mesh` is returned unchanged. Arrays are copied. ``kind`` is used in errors: ``source`` or
+    ``style``. Raises `UserError` for other types, and for data that `load_mesh` or
+    `images.load_image` would reject.
     """
     if isinstance(given, Mesh):
         return given
@@ -53,11 +53,11 @@ def from_arrays(
     visual: Any = None,
     attributes: Any = None,
 ) -> Mesh:
-    """A checked, welded, outward mesh, named ``array``; see `load_mesh`. Of a trimesh's ``visual``
-    texture coordinates, the material and the vertices' colours are kept, and its ``attributes``,
-    arrays (vertices,) or (vertices, width) of numbers by their names.
+    """Make a validated, welded, outward-facing mesh, named ``array``; see `load_mesh`. Keeps a
+    trimesh's texture coordinates, material and vertex colours (``visual``), and its ``attributes``,
+    numeric arrays of shape (vertices,) or (vertices, width), keyed by name.
 
-    Raises `UserError` with the end of a sentence that begins with whose arrays they are.
+    Raises `UserError` with a message that lacks its subject.
     """
     try:
         points, corners = np.array(vertices), np.array(faces)
@@ -66,7 +66,9 @@ def from_arrays(
         points = points.astype(np.float64)
     except (TypeError, ValueError, RuntimeError) as error:
         told = " ".join(str(error).split())[:100].rstrip(".")
-        raise UserError(f"is no pair of numeric arrays ({told}): give (vertices, faces).") from None
+        raise UserError(
+            f"is not a pair of numeric arrays ({told}): give (vertices, faces)."
+        ) from None
     if points.ndim != 2 or points.shape[1] != 3:
         raise UserError(f"has vertices of shape {points.shape}: give (vertices, 3).")
     if corners.ndim != 2 or corners.shape[1] != 3 or not np.issubdtype(corners.dtype, np.integer):
@@ -96,7 +98,7 @@ def from_arrays(
 
 
 def _looks(visual: Any, used: np.ndarray, faces: int, notes: list[str]) -> dict[str, Any]:
-    """What a `Carrier` keeps of a trimesh's ``visual``."""
+    """`Carrier` fields from a trimesh's ``visual``."""
     if visual.kind == "vertex":
         return {"colors": np.asarray(visual.vertex_colors, dtype=np.uint8)[used]}
     if visual.kind == "face":

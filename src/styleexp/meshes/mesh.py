@@ -1,4 +1,4 @@
-"""What a mesh is here, and its small quantities."""
+"""The mesh classes, and basic quantities."""
 
 from __future__ import annotations
 
@@ -15,45 +15,45 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Carrier:
-    """What a file knows about its mesh beyond positions, in the file's own rows.
+    """Everything in a mesh file besides positions, in the file's own rows.
 
     A row is one combination of position, uv, normal and colour; rows on a seam share a vertex.
     """
 
     corners: Int[np.ndarray, "faces 3"]
-    """Rows of each face, in the file's own winding."""
+    """Rows of each face, with the file's winding."""
     rows: Int[np.ndarray, " rows"]
     """Welded vertex of each row."""
     flipped: Bool[np.ndarray, " faces"]
-    """Faces that `Mesh.faces` winds the other way round."""
+    """Faces whose winding is reversed in `Mesh.faces`."""
     precision: float = 0.0
-    """How far apart, in the file's units, positions may be by rounding alone."""
+    """Distance between positions that rounding alone can cause, in the file's units."""
     uv: Float[np.ndarray, "rows 2"] | None = None
-    """v points up, as in OBJ and PLY; glTF's points down."""
+    """Texture coordinates; v points up, as in OBJ and PLY (glTF's points down)."""
     normals: Float[np.ndarray, "rows 3"] | None = None
-    """A glTF or PLY file's: which corners are smooth together, not where they point now."""
+    """Normals of a glTF or PLY file. They only determine which corners are smooth together."""
     colors: UInt8[np.ndarray, "rows 4"] | None = None
     parts: tuple[str, ...] = ("mesh",)
     face_part: Int[np.ndarray, " faces"] | None = None
     materials: tuple[Any, ...] = ()
-    """trimesh's ``PBRMaterial``, each with its name."""
+    """trimesh ``PBRMaterial`` objects, with names."""
     face_material: Int[np.ndarray, " faces"] | None = None
-    """-1 where a face has none."""
+    """Index of each face's material; -1 for none."""
     mtl: str = ""
-    """An OBJ file's material library, so that saving as OBJ loses none of its lines."""
+    """Text of an OBJ file's material library, so that saving as OBJ keeps all its lines."""
     labels: dict[str, tuple[tuple[str, ...], np.ndarray]] = field(default_factory=dict)
-    """What an OBJ file's lines ``g`` and ``s`` say: the texts, and each face's number among them,
+    """Contents of an OBJ file's ``g`` and ``s`` lines: the texts, and each face's index into them,
     -1 before the first."""
     objects: bool = True
-    """Whether an OBJ file has lines ``o``; otherwise its parts are its groups."""
+    """Whether an OBJ file has ``o`` lines; otherwise its groups are its parts."""
     shades: Float[np.ndarray, "rows 3"] | None = None
-    """An OBJ file's colours as they came, NaN where a vertex has none."""
+    """An OBJ file's vertex colours as stored; NaN for vertices without."""
     textures: dict[str, bytes] = field(default_factory=dict)
-    """The image files by the names that ``mtl`` uses."""
+    """Image files, keyed by their names in ``mtl``."""
     face_colors: UInt8[np.ndarray, "faces 4"] | None = None
     attributes: dict[str, Float[np.ndarray, "rows width"]] = field(default_factory=dict)
-    """Numbers and vectors that the file gives its vertices under names of their own: a PLY's
-    properties, a glTF's ``_NAME`` (here without the ``_``, vectors turned as its node is)."""
+    """Custom vertex attributes: a PLY's properties, or a glTF's ``_NAME`` (stored without the
+    ``_``, with vectors rotated by the node's transform)."""
     ply: Any = None
     """A PLY file's `styleexp.meshes.ply_meshes.Table`."""
     document: Any = None
@@ -62,22 +62,22 @@ class Carrier:
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh for the optimiser, with what is needed to save it as it came."""
+    """A triangle mesh for optimisation, with everything needed to save it in its original form."""
 
     name: str
     vertices: Float[np.ndarray, "vertices 3"]
-    """float64, one per position, in the input's own frame and scale."""
+    """float64, one vertex per position, in the input's own frame and scale."""
     faces: Int[np.ndarray, "faces 3"]
     """int64, in the file's order, counter-clockwise seen from outside."""
     repairs: tuple[str, ...] = ()
-    """One readable sentence for each thing that was repaired or left out."""
+    """One sentence for each repair or omission."""
     carrier: Carrier | None = None
 
 
 def at_vertices(
     mesh: Mesh, column: Float[np.ndarray, "rows width"]
 ) -> Float[np.ndarray, "vertices width"]:
-    """What is given for the rows of a mesh's carrier, as means over the rows of each vertex."""
+    """Average per-row values of a mesh's carrier at each vertex."""
     rows = np.arange(len(mesh.vertices)) if mesh.carrier is None else mesh.carrier.rows
     sums = [np.bincount(rows, each, minlength=len(mesh.vertices)) for each in column.T]
     counts = np.bincount(rows, minlength=len(mesh.vertices)).clip(min=1)
@@ -86,23 +86,23 @@ def at_vertices(
 
 @dataclass(frozen=True)
 class Normalisation:
-    """The similarity into the unit sphere: ``apply(v) = (v - center) / scale`` (Sec. 4.1)."""
+    """Similarity transform to the unit sphere: ``apply(v) = (v - center) / scale`` (Sec. 4.1)."""
 
     center: Float[np.ndarray, " 3"]
     scale: float
-    """Largest distance of a vertex from the centre, in the input's units."""
+    """Maximum distance of a vertex from the centre, in the input's units."""
 
     def apply(self, vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "vertices 3"]:
-        """From the input's frame into the unit sphere."""
+        """Map from the input's frame to the unit sphere."""
         return (vertices - self.center) / self.scale
 
     def invert(self, vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "vertices 3"]:
-        """From the unit sphere back into the input's frame."""
+        """Map from the unit sphere to the input's frame."""
         return vertices * self.scale + self.center
 
 
 def normalisation(vertices: Float[np.ndarray, "vertices 3"]) -> Normalisation:
-    """Centre at the vertex mean, scale so that the farthest vertex has distance 1 (Sec. 4.1)."""
+    """Centre at the vertex mean and scale the farthest vertex to distance 1 (Sec. 4.1)."""
     vertices = np.asarray(vertices, dtype=np.float64)
     center = vertices.mean(axis=0)
     scale = float(np.linalg.norm(vertices - center, axis=1).max())
@@ -114,7 +114,7 @@ def normalisation(vertices: Float[np.ndarray, "vertices 3"]) -> Normalisation:
 def face_areas(
     vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
 ) -> Float[np.ndarray, " faces"]:
-    """Area of each face, in squared units of the vertices."""
+    """Area of each face, in squared units of ``vertices``."""
     return 0.5 * np.linalg.norm(_crosses(vertices, faces), axis=1)
 
 
@@ -123,13 +123,14 @@ def vertex_normals(
     faces: Int[np.ndarray, "faces 3"],
     groups: Int[np.ndarray, "faces 3"] | None = None,
 ) -> Float[np.ndarray, "vertices 3"]:
-    """Unit vertex normals, the faces' weighted by area.
+    """Unit vertex normals, area-weighted.
 
-    Faces without area add nothing. A vertex whose normal cancels out or that no face uses gets the
-    direction from the vertices' mean to it, so that every normal is finite and of length 1.
+    Zero-area faces contribute nothing. A vertex whose normal cancels out, or without faces, gets
+    the direction from the vertices' mean to itself, so that every normal is finite and has length
+    1.
 
-    ``groups`` numbers the corners that are smooth together, where a vertex at a hard edge has
-    several normals; the result then has a row for each group.
+    ``groups`` are the smoothing groups of corners, so that a vertex at a hard edge has several
+    normals; the result then has one row per group.
     """
     vertices = points = np.asarray(vertices, dtype=np.float64)
     if groups is None:
@@ -138,7 +139,7 @@ def vertex_normals(
         points = np.zeros((int(groups.max()) + 1, 3))
         points[groups] = vertices[faces]
     extent = float(np.ptp(vertices, axis=0).max()) or 1.0
-    # Unit extent, so that squares of tiny or huge coordinates neither vanish nor overflow.
+    # Scale to unit extent, so that squared coordinates neither underflow nor overflow.
     crosses = np.repeat(_crosses(vertices / extent, faces), 3, axis=0)
     sums = [np.bincount(groups.ravel(), crosses[:, k], minlength=len(points)) for k in range(3)]
     normals = np.stack(sums, axis=1)

@@ -1,6 +1,6 @@
-"""OBJ files. trimesh would group the faces by material; here they stay in the file's order.
+"""OBJ files. Faces stay in the file's order, whereas trimesh groups them by material.
 
-Their normals are not read: most are those of the faces of a smooth surface, and would facet it.
+Normals are ignored: most are face normals of a smooth surface, and would make it faceted.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ OTHERS = ("l", "p", "curv", "curv2", "surf", "parm", "trim", "hole", "sp", "con"
 
 
 def read_obj(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
-    """The rows' positions, all else, and notes."""
+    """Read the rows' positions, the carrier, and notes."""
     tables: dict[str, list[list[str]]] = {"v": [], "vt": []}
-    polygons: list[list[int]] = []  # v and vt of each corner in turn
+    polygons: list[list[int]] = []  # v and vt of each corner
     polygon_part, polygon_material = [], []
     parts: dict[str, int] = {}
     labels: dict[str, dict[str, int]] = {"g": {}, "s": {}}
@@ -78,7 +78,7 @@ def read_obj(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
 
     notes: list[str] = []
     if polygons and not data.rstrip(b" \t\0").endswith((b"\n", b"\r")):
-        notes.append("its last line has no end: if the file was cut off, faces are missing")
+        notes.append("its last line is incomplete: if the file was truncated, faces are missing")
     if ignored:
         lines = plural(sum(ignored.values()), "line", "lines")
         notes.append(f"left out {lines} of points, lines and curves ({', '.join(ignored)})")
@@ -104,7 +104,7 @@ def read_obj(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
         groups, group = chosen["g"]
         part_names = (*groups, path.stem)
         face_part = np.where(group < 0, len(groups), group)
-    # A row is one combination of position and texture coordinate.
+    # A row is a combination of position and texture coordinate.
     rows, inverse = np.unique(index[corner.ravel()], axis=0, return_inverse=True)
     unused = len(positions) - len(np.unique(rows[:, 0]))
     if unused and len(corner):
@@ -133,10 +133,10 @@ def read_obj(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
 def triangulate(
     counts: np.ndarray, points: np.ndarray, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles of polygons, in the polygons' order: fans, and quads cut along the inner diagonal.
+    """Triangulate polygons, in order: as fans, and quads along the inner diagonal.
 
     ``counts`` (polygons,) and ``points`` (sum of counts, 3) are runs of corners. Returns triangles
-    (t, 3) into the corners and the polygon (t,) that each came from.
+    (t, 3) as corner indices, and the polygon (t,) of each.
     """
     start = np.cumsum(counts) - counts
     corner = np.arange(len(points))
@@ -191,9 +191,9 @@ def _text(data: bytes) -> str:
 
 
 def _vertices(lines: list[list[str]]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Positions (n, 3), and colours (n, 3) as they came, NaN where a line has none.
+    """Positions (n, 3), and colours (n, 3) as stored, NaN for lines without.
 
-    Lines are ``x y z``, ``x y z w``, ``x y z r g b`` or ``x y z w r g b``; w is not used.
+    Lines are ``x y z``, ``x y z w``, ``x y z r g b`` or ``x y z w r g b``; w is ignored.
     """
     if min(map(len, lines), default=3) < 3:
         raise UserError("has a vertex with fewer than three coordinates: export it again.")
@@ -214,7 +214,7 @@ def _vertices(lines: list[list[str]]) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def _bytes(shades: np.ndarray) -> np.ndarray:
-    """8-bit colours (n, 4) of floats up to 1 or numbers up to 255; white where there are none."""
+    """8-bit colours (n, 4) from floats up to 1 or numbers up to 255; white if missing."""
     top = 1.0 if np.nanmax(shades) > 1.0 else 255.0
     values = np.clip(np.where(np.isnan(shades), 255.0, shades * top), 0, 255).round()
     return np.insert(values, 3, 255, axis=1).astype(np.uint8)
@@ -229,7 +229,7 @@ def _number(word: str) -> bool:
 
 
 def _uv(lines: list[list[str]], chosen: np.ndarray) -> np.ndarray | None:
-    """Texture coordinates (rows, 2), zero where a row has none; None if none has."""
+    """Texture coordinates (rows, 2), zero for rows without; None if no row has them."""
     if not (chosen >= 0).any():
         return None
     return np.array([[*line, "0", "0"][:2] for line in [*lines, []]], dtype=np.float64)[chosen]
@@ -238,10 +238,10 @@ def _uv(lines: list[list[str]], chosen: np.ndarray) -> np.ndarray | None:
 def _materials(
     path: Path, libraries: list[str], notes: list[str]
 ) -> tuple[str, dict[str, bytes], dict[str, Any]]:
-    """The libraries' text, the images they name, and the materials by name."""
+    """Text of the material libraries, the images they name, and the materials by name."""
     texts: list[str] = []
     textures: dict[str, bytes] = {}
-    pictures: dict[str, bytes] = {}  # those that can be decoded
+    pictures: dict[str, bytes] = {}  # only decodable ones
     root = path.parent
     for library in libraries:
         # One line may name several libraries, or one whose name has spaces.
@@ -261,7 +261,7 @@ def _materials(
                 content = image.read_bytes()
                 textures.setdefault(wanted, content)
                 if fault := images.fault(content):
-                    notes.append(f"kept the texture '{wanted}' for OBJ alone: it {fault}")
+                    notes.append(f"kept the texture '{wanted}' in OBJ only: it {fault}")
                 else:
                     pictures.setdefault(wanted, content)
     text = "\n".join(texts)

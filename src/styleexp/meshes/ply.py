@@ -1,4 +1,4 @@
-"""PLY files as tables: every element with all its properties, lists among them."""
+"""PLY files as tables: every element with all its properties, including lists."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ EARLY = "ends too early: copy or export the mesh again."
 
 @dataclass(frozen=True)
 class Lists:
-    """A list property: the entries of all rows behind each other."""
+    """A list property: the concatenated entries of all rows."""
 
     lengths: np.ndarray
-    """(rows,), of the file's own type."""
+    """(rows,), in the file's own type."""
     values: np.ndarray
     """(sum of the lengths,)"""
 
     def take(self, rows: np.ndarray) -> Lists:
-        """The lists of some rows, in their order."""
+        """The lists of some rows, in that order."""
         lengths = self.lengths.astype(np.int64)
         start = np.cumsum(lengths) - lengths
         return Lists(self.lengths[rows], self.values[_runs(start[rows], lengths[rows])])
@@ -41,22 +41,22 @@ Column = np.ndarray | Lists
 
 @dataclass(frozen=True)
 class Ply:
-    """The tables of a PLY file, by their elements' and properties' names, in its order."""
+    """The tables of a PLY file, keyed by element and property name, in file order."""
 
     elements: dict[str, dict[str, Column]]
     comments: list[str] = field(default_factory=list)
-    """Whole lines of the header, ``comment …`` and ``obj_info …``."""
+    """Header lines ``comment …`` and ``obj_info …``."""
     left: bool = False
-    """Whether more came after the last element."""
+    """Whether there is data after the last element."""
 
 
 def take(column: Column, rows: np.ndarray) -> Column:
-    """Some rows of a column."""
+    """Select rows of a column."""
     return column.take(rows) if isinstance(column, Lists) else column[rows]
 
 
 def numbers(columns: dict[str, Column], *names: str) -> np.ndarray:
-    """Some properties that are no lists, (rows, names), float64. Raises `UserError` if one is."""
+    """Scalar properties as float64 (rows, names). Raises `UserError` for a list property."""
     found = [column for name in names if isinstance(column := columns[name], np.ndarray)]
     if len(found) < len(names):
         raise UserError(f"has lists for {', '.join(names)}: export the mesh again.")
@@ -64,7 +64,7 @@ def numbers(columns: dict[str, Column], *names: str) -> np.ndarray:
 
 
 def stored_result(data: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Vertices (n, 3), faces (m, 3) and displacement (n,) of a ``result.ply``, rows as stored."""
+    """Vertices (n, 3), faces (m, 3) and displacement (n,) of a ``result.ply``, in file order."""
     elements = parse(data).elements
     vertex, corners = elements["vertex"], elements["face"]["vertex_indices"]
     assert isinstance(corners, Lists)
@@ -75,12 +75,12 @@ def stored_result(data: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray | Non
 def parse(data: bytes) -> Ply:
     """Read a PLY file, ASCII or binary.
 
-    Raises `UserError`, the end of a sentence that begins with the file's name.
+    Raises `UserError` with a message that lacks its subject, the file's name.
     """
     head = re.match(rb"ply[ \t]*(\r\n|\n|\r)(?:.*?(?:\r\n|\n|\r))??end_header[ \t]*(\r\n|\n|\r|$)",
                     data, re.DOTALL)  # fmt: skip
     if head is None:
-        what = "has a header without end" if data.startswith(b"ply") else "is not a PLY file"
+        what = "has an unterminated header" if data.startswith(b"ply") else "is not a PLY file"
         raise UserError(f"{what}: export the mesh again.")
     kind, comments = "", []
     layout: dict[str, tuple[int, list[tuple[str, str, str | None]]]] = {}
@@ -111,13 +111,15 @@ def parse(data: bytes) -> Ply:
     elif kind in orders:
         reader = _Binary(body, orders[kind])
     else:
-        raise UserError(f"is of the format '{kind[:20]}', which PLY has not: export it again.")
+        raise UserError(
+            f"has the format '{kind[:20]}', which PLY does not define: export it again."
+        )
     elements = {name: reader.element(name, *rest) for name, rest in layout.items()}
     return Ply(elements, comments, reader.left())
 
 
 def written(ply: Ply) -> bytes:
-    """The bytes of a PLY file, binary with the least byte first."""
+    """Serialise a PLY file, binary little-endian."""
     head = ["ply", "format binary_little_endian 1.0", *ply.comments]
     body = []
     for element, columns in ply.elements.items():
@@ -136,7 +138,7 @@ def written(ply: Ply) -> bytes:
 
 
 def _packed(columns: dict[str, Column], count: int) -> bytes:
-    """Rows of bytes, each with all its columns."""
+    """Pack all columns, row by row."""
     if not any(isinstance(c, Lists) and np.ptp(c.lengths) for c in columns.values() if count):
         fields: list[tuple[str, str, int]] = []
         parts: list[np.ndarray] = []
@@ -186,7 +188,7 @@ class _Binary:
     def _even(
         self, count: int, properties: list[tuple[str, str, str | None]]
     ) -> dict[str, Column] | None:
-        """The columns if each list has the same length in all rows."""
+        """Columns of an element whose lists have the same length in all rows."""
         at, fields = self.at, []
         for k, (_, each, length) in enumerate(properties):
             width = 1
@@ -319,12 +321,12 @@ def _numbers(words: list[bytes], kind: str, what: str) -> np.ndarray:
         return values.astype(kind)
     limits = np.iinfo(kind)
     if len(values) and not (values.min() >= limits.min and values.max() <= limits.max):
-        raise UserError(f"has numbers in {what} that its type cannot hold: export it again.")
+        raise UserError(f"has numbers in {what} that its type cannot represent: export it again.")
     return values.astype(kind)
 
 
 def _runs(start: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """``start[0], start[0] + 1, …`` of each run behind those before."""
+    """Concatenate ``start, start + 1, …`` over all runs."""
     total = np.cumsum(length)
     return np.arange(int(total[-1]) if len(total) else 0) + np.repeat(
         start - total + length, length
@@ -343,6 +345,6 @@ def _fresh(layout: dict, name: str) -> bool:
 def _type(name: str) -> str:
     if name not in TYPES:
         raise UserError(
-            f"has numbers of the type '{name[:20]}', which PLY has not: export it again."
+            f"has numbers of the type '{name[:20]}', which PLY does not define: export it again."
         )
     return TYPES[name]

@@ -1,4 +1,4 @@
-"""PLY files as meshes: what of their tables means something here, and the rest to be kept."""
+"""PLY files as meshes: interprets known properties and preserves the rest."""
 
 from __future__ import annotations
 
@@ -22,39 +22,41 @@ UVS = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"), ("texture_s", "textur
 CORNERS = ("vertex_indices", "vertex_index")
 DISPLACEMENT = "displacement"
 VECTOR = {2: ("_x", "_y"), 3: ("_x", "_y", "_z"), 4: ("_x", "_y", "_z", "_w")}
-"""Ends of the names of a vector's numbers, as Blender writes them."""
+"""Name suffixes of a vector's components, as in Blender."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """What a PLY file has of each row and face, in its own types and order."""
+    """A PLY file's data per row and face, in its own types and order."""
 
     vertex: dict[str, Column]
-    """Of the rows; positions, normals and texture coordinates in it are as they were read."""
+    """Properties of the rows; positions, normals and texture coordinates as originally read."""
     face: dict[str, Column]
-    """Of the triangles; those of a polygon all have what it had. Without the corners."""
+    """Properties of the triangles, without the corners. All triangles of a polygon share its
+    values."""
     comments: tuple[str, ...] = ()
 
     @property
     def own(self) -> tuple[str, ...]:
-        """Names of the vertices' properties that mean nothing here."""
+        """Names of custom vertex properties."""
         known = {*POSITION, *NORMAL, *COLOR, "alpha", DISPLACEMENT, *sum(UVS, ())}
         return tuple(name for name in self.vertex if name not in known)
 
     @property
     def own_faces(self) -> tuple[str, ...]:
-        """The same of the faces."""
+        """Names of custom face properties."""
         return tuple(name for name in self.face if name not in (*COLOR, "alpha"))
 
     @property
     def rows(self) -> bool:
-        """Whether vertices at one place may differ in more than colours and coordinates."""
+        """Whether vertices at the same position may differ in more than colours and texture
+        coordinates."""
         return bool(self.own) or NORMAL[0] in self.vertex
 
 
 def attributes_of(vertex: dict[str, Column], names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """The named properties as float64 (rows, width). Lists that are all of one length are vectors,
-    and so are three numbers ``NAME_x``, ``NAME_y`` and ``NAME_z`` (or without the ``_``)."""
+    """The named properties as float64 (rows, width). Lists of equal length are vectors, and so are
+    ``NAME_x``, ``NAME_y`` and ``NAME_z`` (with or without the ``_``)."""
     found = {}
     for name in names:
         column = vertex[name]
@@ -74,7 +76,7 @@ def attributes_of(vertex: dict[str, Column], names: tuple[str, ...]) -> dict[str
 
 
 def read_ply(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
-    """The rows' positions (rows, 3), all else, and notes."""
+    """Read the rows' positions (rows, 3), the carrier, and notes."""
     ply = parse(data)
     vertex, face = ply.elements.get("vertex", {}), dict(ply.elements.get("face", {}))
     if not all(isinstance(vertex.get(name), np.ndarray) for name in POSITION):
@@ -84,7 +86,7 @@ def read_ply(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
     if corners is None or not len(corners.lengths if isinstance(corners, Lists) else ()):
         if "tristrips" in ply.elements:
             raise UserError(
-                "stores its surface as triangle strips, which are not read: export it again, "
+                "stores its surface as triangle strips, which are not supported: export it again, "
                 "with faces."
             )
         nothing = np.zeros((0, 3), dtype=np.int64)
@@ -96,7 +98,7 @@ def read_ply(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
     corner, owner = triangulate(counts, positions[index], notes)
     if not len(corner):
         raise UserError("has no face with three corners: export the mesh again.")
-    # The second half of a quad begins at its third corner.
+    # The second half of a quad starts at its third corner.
     second = (counts[owner] == 4) & (np.diff(owner, prepend=-1) == 0)
     corner[second] = np.roll(corner[second], -1, axis=1)
 
@@ -105,7 +107,7 @@ def read_ply(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
     if wedges is None:
         chosen, inverse = np.unique(index[corner.ravel()], return_inverse=True)
         uv = None if uv is None else uv[chosen]
-    else:  # a row is one combination of vertex and texture coordinates
+    else:  # a row is a combination of vertex and texture coordinates
         del face["texcoord"]
         table = np.column_stack([index, wedges])[corner.ravel()]
         table, inverse = np.unique(table, axis=0, return_inverse=True)
@@ -113,9 +115,7 @@ def read_ply(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
     if unused := len(positions) - len(np.unique(chosen)):
         notes.append(f"left out {plural(unused, 'vertex', 'vertices')} that no face uses")
     if ply.left:
-        notes.append(
-            "has more after its last element than it says: if it is damaged, faces are missing"
-        )
+        notes.append("has data after its last element: if it is damaged, faces are missing")
     others = [f"'{name}'" for name in ply.elements if name not in ("vertex", "face")]
     if others:
         word = "element" if len(others) == 1 else "elements"
@@ -164,17 +164,18 @@ def ply_of(
     normals: np.ndarray | None,
     displacement: np.ndarray | None,
 ) -> bytes:
-    """A PLY file of the rows ``first``, now at ``points`` (rows, 3), and of ``faces`` into them.
+    """Make a PLY file of the rows ``first``, moved to ``points`` (rows, 3), and ``faces`` into
+    them.
 
-    What else the file had is as it came, in its types. Without one positions are floats.
-    ``displacement`` (rows,) becomes a float property.
+    Everything else from the source PLY is preserved, in its types. Without a source PLY, positions
+    are floats. ``displacement`` (rows,) is written as a float property.
     """
     vertex: dict[str, Column] = {name: np.zeros(0, np.float32) for name in POSITION}
     face: dict[str, Column] = {}
     comments: list[str] = []
     if carrier.ply is not None:
         vertex = {name: take(column, first) for name, column in carrier.ply.vertex.items()}
-        vertex.pop(DISPLACEMENT, None)  # of an input that is itself a result
+        vertex.pop(DISPLACEMENT, None)  # if the input is itself a result
         face, comments = dict(carrier.ply.face), list(carrier.ply.comments)
     for k, name in enumerate(POSITION):
         vertex[name] = points[:, k].astype(_float(vertex[name]))
@@ -204,13 +205,13 @@ def ply_of(
 
 
 def _float(column: Column) -> np.dtype:
-    """The column's own type, if it holds fractions."""
+    """The column's own dtype if floating-point, else float32."""
     kind = column.dtype if isinstance(column, np.ndarray) else np.dtype(np.float32)
     return kind if kind.kind == "f" else np.dtype(np.float32)
 
 
 def _colors(table: dict[str, Column]) -> np.ndarray | None:
-    """8-bit colours (rows, 4) of integers of any size, or of floats in [0, 1]."""
+    """8-bit colours (rows, 4), from integers of any size or floats in [0, 1]."""
     if not set(COLOR) <= table.keys():
         return None
     names = (*COLOR, "alpha") if "alpha" in table else COLOR
@@ -225,7 +226,7 @@ def _colors(table: dict[str, Column]) -> np.ndarray | None:
 
 
 def _wedges(face: dict[str, Column], counts: np.ndarray) -> np.ndarray | None:
-    """Texture coordinates of every polygon's corners, (corners, 2), as MeshLab writes them."""
+    """Texture coordinates per polygon corner, (corners, 2), as written by MeshLab."""
     given = face.get("texcoord")
     if not isinstance(given, Lists) or (given.lengths.astype(np.int64) != 2 * counts).any():
         return None
@@ -235,7 +236,7 @@ def _wedges(face: dict[str, Column], counts: np.ndarray) -> np.ndarray | None:
 def _textures(
     ply: Ply, path: Path, face: dict[str, Column], owner: np.ndarray, notes: list[str]
 ) -> tuple[tuple[Any, ...], np.ndarray | None]:
-    """Materials of the images that comments name, and each triangle's."""
+    """Materials for the images named in comments, and each triangle's material."""
     from PIL import Image
 
     names = [c.split(None, 2)[2] for c in ply.comments if c.lower().startswith("comment texturef")
@@ -261,12 +262,12 @@ def _textures(
 
 
 def _only_in_ply(table: Table) -> list[str]:
-    """One note on what the other formats that results are saved in can't hold."""
+    """A note on data that only PLY can store among the result formats."""
     vertex, face = ", ".join(table.own), ", ".join(table.own_faces)
     colors = "face colours" if COLOR[0] in table.face else ""
     no_obj = [colors, f"vertex properties ({vertex})" if vertex else "",
               f"face properties ({face})" if face else ""]  # fmt: skip
-    parts = [f"OBJ has no room for {', '.join(filter(None, no_obj))}"] if any(no_obj) else []
+    parts = [f"OBJ can't store {', '.join(filter(None, no_obj))}"] if any(no_obj) else []
     if face:
-        parts.append(f"GLB none for face properties ({face})")
-    return ["saved whole as PLY alone: " + "; ".join(parts)] if parts else []
+        parts.append(f"GLB can't store face properties ({face})")
+    return ["only the PLY is complete: " + "; ".join(parts)] if parts else []

@@ -1,4 +1,4 @@
-"""How far apart two positions of a file may be and still have been one, from how it stores them."""
+"""Rounding tolerance of a file's positions, from its number format."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ from collections.abc import Sequence
 import numpy as np
 
 ULPS = 4
-"""Two roundings of one number are a unit in the last place apart, on each axis; doubled, as what
-was computed twice often is off by two."""
+"""Tolerance in units in the last place. Two roundings of a number differ by one per axis; doubled,
+because values computed twice often differ by two."""
 SAMPLE = 20_000
 NUMBER = re.compile(rb"[-+]?(\d*)\.?(\d*)(?:[eE][-+]?\d+)?")
 
 
 def of_floats(points: np.ndarray) -> float:
-    """Of single precision: a few of the largest coordinate's units in the last place."""
+    """Tolerance for single precision: a few ULPs of the largest coordinate."""
     largest = np.abs(points).max(initial=0.0)
-    if not largest < np.finfo(np.float32).max:  # infinite or NaN: refused later
+    if not largest < np.finfo(np.float32).max:  # infinite or NaN: rejected later
         return 0.0
     return ULPS * float(np.spacing(np.float32(largest)))
 
 
 def of_text(words: Sequence[bytes | str], points: np.ndarray) -> float:
-    """Of written numbers: two units of the last digit that the largest coordinate has.
+    """Tolerance for text: two units of the last digit of the largest coordinate.
 
-    Up to nine digits are what singles are printed with, so they count as singles, too. Fewer than
-    six are no rounded numbers, but such as someone chose.
+    Up to nine digits may be printed singles, so the single-precision tolerance applies, too.
+    Numbers with fewer than six digits count as exact, not rounded.
     """
     some = words[:: max(1, len(words) // SAMPLE)]
     digits = max((_digits(w if isinstance(w, bytes) else w.encode()) for w in some), default=0)
@@ -41,10 +41,10 @@ def of_text(words: Sequence[bytes | str], points: np.ndarray) -> float:
 
 
 def _digits(word: bytes) -> int:
-    """Significant digits, trailing zeros among them: they were written."""
+    """Number of significant digits, including written trailing zeros."""
     match = NUMBER.fullmatch(word)
     if match is None:
         return 0
-    # Without a point trailing zeros say nothing: 1000 is as good as 1.
+    # Without a point, trailing zeros are not significant.
     whole = match[1] + match[2]
     return len((whole if match[2] else whole.rstrip(b"0")).lstrip(b"0"))

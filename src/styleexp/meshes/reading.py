@@ -1,4 +1,4 @@
-"""Files to meshes, and one sentence on what is wrong with one; STL and OFF by trimesh."""
+"""Load mesh files, with one-sentence errors; STL and OFF through trimesh."""
 
 from __future__ import annotations
 
@@ -28,19 +28,18 @@ READABLE = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
 def load_mesh(path: str | os.PathLike[str], weld: float | None = None) -> Mesh:
     """Load an OBJ, PLY, STL, OFF, GLB or glTF file as one welded triangle mesh.
 
-    ``weld`` is the distance in the file's units within which vertices along open edges are one; 0
-    joins only those at the same position. By default it is what the file's numbers can't tell
-    apart: a few units in the last place of single precision, or of the digits written.
+    ``weld`` is the distance, in the file's units, within which vertices on open edges are merged; 0
+    merges only coincident ones. The default is the file's numeric precision: a few units in the
+    last place of single precision, or of the written digits.
 
-    Faces keep the file's order, quads and n-gons triangulated in place (but an OFF file that
-    mixes them gives its triangles first). Vertices that no
-    face uses are left out. All geometries of a glTF scene are joined in world space. Parts whose
-    faces point inwards, or disagree among themselves, are turned for the optimisation and saved
-    with the file's own winding. Open, non-manifold and multi-component meshes are accepted,
-    degenerate faces are kept.
+    Faces keep the file's order; quads and n-gons are triangulated in place (except that an OFF file
+    with mixed polygons gives its triangles first). Unused vertices are dropped. All geometries of a
+    glTF scene are joined in world space. Parts whose faces point inwards or are inconsistent are
+    flipped for the optimisation, but saved with the file's own winding. Open, non-manifold and
+    multi-component meshes are accepted; degenerate faces are kept.
 
-    Raises `UserError`, one sentence with the file's name and a remedy, for anything that is not a
-    mesh with a surface.
+    Raises `UserError`, one sentence with the file's name and a remedy, for anything but a mesh with
+    a surface.
     """
     path = Path(path)
     kind = path.suffix.lower()
@@ -54,13 +53,13 @@ def load_mesh(path: str | os.PathLike[str], weld: float | None = None) -> Mesh:
     except FileNotFoundError:
         raise UserError(f"'{path}' does not exist: check the path of the mesh.") from None
     except PermissionError:
-        raise UserError(f"'{path}' may not be read: change the file's permissions.") from None
+        raise UserError(f"'{path}' is not readable: change the file's permissions.") from None
     except OSError as error:
         raise UserError(f"'{path}' cannot be read ({error.strerror or error}).") from None
     if not data.strip():
         raise UserError(f"'{path}' is empty: export the mesh again.")
     try:
-        # Junk may hold numbers that overflow on the way; `weld` speaks about them.
+        # Garbage may contain numbers that overflow; `weld` reports them.
         with np.errstate(all="ignore"):
             read = READERS.get(kind, _read)
             points, carrier, notes = read(data, path)
@@ -69,7 +68,7 @@ def load_mesh(path: str | os.PathLike[str], weld: float | None = None) -> Mesh:
         raise UserError(f"'{path}' {error}") from None
     except MemoryError:
         raise UserError(
-            f"'{path}' needs more memory than there is: give a smaller mesh, or export it again."
+            f"'{path}' needs more memory than available: give a smaller mesh, or export it again."
         ) from None
     except Exception as error:
         detail = " ".join(str(error).split())[:120]
@@ -80,7 +79,7 @@ def load_mesh(path: str | os.PathLike[str], weld: float | None = None) -> Mesh:
 
 
 def _read(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
-    """The rows' positions, all else, and notes, of a format that trimesh reads."""
+    """Read the rows' positions, the carrier, and notes, through trimesh."""
     kind = path.suffix.lower()[1:]
     whole.check(kind, data)
     resolver = Beside(path)
@@ -88,7 +87,7 @@ def _read(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
     notes: list[str] = []
     nodes = _own_geometries(scene)
     if len(nodes) < len(scene.graph.nodes_geometry):
-        notes.append("left out what has no faces")
+        notes.append("left out parts without faces")
     if not nodes:
         nothing = np.zeros((0, 3), dtype=np.int64)
         points = [nothing, *(each.vertices for each in scene.geometry.values())]
@@ -113,7 +112,7 @@ def _read(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
         shape.remove_unreferenced_vertices()
         unused -= len(shape.vertices)
 
-        # The specification: a mirrored node winds the other way.
+        # Per the specification, a mirrored node reverses the winding.
         faces = shape.faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else shape.faces
         part = node if len(nodes) > 1 else path.stem
         number, material = -1, _material(shape.visual)
@@ -157,13 +156,13 @@ def _precision(kind: str, data: bytes, points: np.ndarray) -> float:
 
 
 def _declared_faces(kind: str, data: bytes) -> int:
-    """How many an OFF file promises: trimesh takes what there is of a file cut off."""
+    """Number of faces declared by an OFF file, because trimesh accepts truncated files."""
     counts = re.search(rb"^(?:OFF)?[ \t]*\d+[ \t]+(\d+)", data, re.MULTILINE)
     return int(counts[1]) if kind == "off" and counts else 0
 
 
 def _own_geometries(scene: trimesh.Scene) -> list[str]:
-    """The nodes that show a surface, in the order of the file's meshes, each given its own copy."""
+    """Nodes with a surface, in the order of the file's meshes, each with its own copy."""
     position = {name: k for k, name in enumerate(scene.geometry)}
     parents = scene.graph.transforms.parents
     nodes = sorted(scene.graph.nodes_geometry, key=lambda node: position[scene.graph[node][1]])
@@ -184,7 +183,8 @@ def _own_geometries(scene: trimesh.Scene) -> list[str]:
 
 
 def _in_file_order(faces: np.ndarray) -> np.ndarray:
-    """trimesh gives the first halves of all quads, then the second ones: bring them together."""
+    """Interleave quad halves: trimesh returns the first halves of all quads, then the second
+    ones."""
     first, second = faces[: len(faces) // 2], faces[len(faces) // 2 :]
     if len(first) == len(second) and (first[:, [2, 0]] == second[:, [0, 2]]).all():
         return np.stack([first, second], axis=1).reshape(-1, 3)
@@ -205,7 +205,7 @@ def _material(visual: Any) -> Any:
 
 
 def _joined(columns: list[Any], lengths: list[int], filler: np.ndarray) -> np.ndarray | None:
-    """One column of all rows, filled where a part has none; None if no part has it."""
+    """One attribute for all rows, filled where a part lacks it; None if no part has it."""
     if all(each is None for each in columns):
         return None
     filled: list[np.ndarray] = [

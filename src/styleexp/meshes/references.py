@@ -1,7 +1,7 @@
 """The files that a mesh file names: material libraries, textures, buffers.
 
-A mesh may come from anywhere, so only files in or below its own folder are read for it, wherever
-``../``, an absolute path or a symbolic link would lead.
+Meshes are untrusted, so only files in or below the mesh's folder are read, regardless of ``../``,
+absolute paths and symbolic links.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ from trimesh.resolvers import Resolver
 
 from styleexp.errors import UserError
 
-OUTSIDE = "lies outside the mesh's folder"
+OUTSIDE = "is outside the mesh's folder"
 ABSENT = "was not found"
 
 
 def bare(name: str) -> str:
-    """The file's name without folders, be they written the Unix or the Windows way."""
+    """The file's name without folders, for Unix or Windows paths."""
     return re.split(r"[/\\]", name)[-1]
 
 
 def find(name: str, folder: Path, root: Path) -> tuple[Path | None, str]:
-    """The file that ``name`` in ``folder`` means, or None and why there is none.
+    """Resolve ``name`` in ``folder`` to a file, or return None and the reason.
 
-    Nothing outside of ``root`` is found, with symbolic links followed. Files made elsewhere often
-    hold an absolute or a Windows path: then the bare name is tried.
+    Never returns a file outside ``root``, after following symbolic links. Absolute and Windows
+    paths, common in files from other machines, are retried as bare names.
     """
     reason = ABSENT
     root = root.resolve()
     for candidate in dict.fromkeys((name, name.replace("\\", "/"), unquote(name), bare(name))):
         try:
             real = (folder / candidate).resolve(strict=True)
-        except (OSError, ValueError, RuntimeError):  # absent, not a path, a circle of links
+        except (OSError, ValueError, RuntimeError):  # missing, not a path, or a symlink loop
             continue
         if not real.is_relative_to(root):
             reason = OUTSIDE
@@ -46,36 +46,37 @@ def find(name: str, folder: Path, root: Path) -> tuple[Path | None, str]:
 
 
 class Beside(Resolver):
-    """Gives trimesh what lies beside a mesh file, by `find`'s rules."""
+    """trimesh resolver for files next to a mesh file, with the rules of `find`."""
 
     def __init__(self, path: Path):
         self.folder = path.absolute().parent
 
     def get(self, name: str) -> bytes:
-        """A file's content. Raises `UserError`, the end of a sentence that begins with the mesh."""
+        """Read a file. Raises `UserError` with a message that lacks its subject, the mesh's
+        name."""
         found, reason = find(name, self.folder, self.folder)
         if found is None:
             raise UserError(
-                f"refers to the file '{name}', which {reason}: put it beside the mesh, under that "
+                f"refers to the file '{name}', which {reason}: put it next to the mesh, under that "
                 "name."
             )
         return found.read_bytes()
 
     def keys(self) -> list[str]:
-        """Nothing is listed: what a file does not name is not offered to it."""
+        """Return an empty list: only named files can be read."""
         return []
 
     def write(self, name: str, data: object) -> None:
-        """Reading a mesh writes nothing."""
+        """Do nothing: reading a mesh writes no files."""
         raise NotImplementedError
 
     def namespaced(self, namespace: str) -> Beside:
-        """The same place: folders of archives are not read."""
+        """Return self: namespaces of archives are not supported."""
         return self
 
 
 def resolved(uri: str, beside: Beside) -> bytes:
-    """What a URI stands for: data in itself, or a file in the mesh's folder."""
+    """Resolve a URI: embedded data, or a file in the mesh's folder."""
     if not uri.startswith("data:"):
         return beside.get(uri)
     head, _, body = uri.partition(",")

@@ -1,4 +1,4 @@
-"""More vertices where a relief needs them, on the mesh's own surface, with all that lies on it."""
+"""Refine a mesh for a relief, preserving its surface and attributes."""
 
 from __future__ import annotations
 
@@ -15,25 +15,24 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
 ROUNDS = 12
-"""Each halves the longest edges."""
+"""Maximum number of rounds; each splits the longest edges."""
 CREASE = 0.8
-"""Cosine between a vertex's normal and a face's below which the vertex lies on a crease: edges to
-it stay straight."""
+"""Cosine between a vertex normal and a face normal below which the vertex is on a crease; its edges
+stay straight."""
 MOST_FACES = 4_000_000
 
 
 def refine(mesh: Mesh, longest: float) -> Mesh:
-    """The mesh with edges of at most ``longest``, in its own units: longer ones are halved, and the
-    faces at them cut in two to four, until none is left.
+    """Refine until no edge is longer than ``longest``, in the mesh's own units: longer edges are
+    split in half, and their faces into two to four.
 
-    New vertices lie on a cubic curve through the ends of their edge that stands upright on the
-    normals there (as in Vlachos et al. 2001), so smooth parts become no facets; at creases and
-    boundaries they lie in the middle. Texture coordinates, colours, the vertices' own numbers and
-    vectors, materials, parts and groups are carried over, seams stay seams. What else only a PLY's
-    or glTF file's own tables hold is left out, with a note in ``repairs``. A mesh that is fine
-    enough is returned as it is.
+    New vertices lie on a cubic curve through the ends of their edge, perpendicular to the normals
+    there (as in Vlachos et al. 2001), so smooth parts stay smooth; at creases and boundaries they
+    are edge midpoints. Texture coordinates with their seams, colours, custom vertex attributes,
+    materials, parts and groups are preserved. Other data of a PLY or glTF file is dropped, with a
+    note in ``repairs``. A mesh that is fine enough is returned unchanged.
 
-    Raises `UserError` where it would take more than `MOST_FACES` faces.
+    Raises `UserError` if more than `MOST_FACES` faces would be needed.
     """
     if not longest > 0:
         raise ValueError(f"edges of at most {longest}")
@@ -54,14 +53,14 @@ def refine(mesh: Mesh, longest: float) -> Mesh:
             break
         if len(faces) + 2 * split.sum() > MOST_FACES:
             raise UserError(
-                f"'{mesh.name}' would need more than {MOST_FACES:,} faces to carry this relief: "
-                "give a larger style.scale."
+                f"'{mesh.name}' would need more than {MOST_FACES:,} faces for this relief: "
+                "increase style.scale."
             )
         outward = np.where(carrier.flipped[:, None], faces[:, ::-1], faces)
         vertices, carrier = _split(vertices, carrier, outward, edges, of_face, split)
     if len(carrier.corners) == before:
         return mesh
-    left_out = "skins, animations and what else a glTF file holds" if carrier.document else ""
+    left_out = "skins, animations and other glTF data" if carrier.document else ""
     left_out = _ply_alone(carrier) if carrier.ply else left_out
     note = f"refined from {before:,} to {len(carrier.corners):,} faces"
     if left_out:
@@ -76,7 +75,7 @@ def refine(mesh: Mesh, longest: float) -> Mesh:
 def _edges(
     faces: Int[np.ndarray, "faces 3"],
 ) -> tuple[Int[np.ndarray, "edges 2"], Int[np.ndarray, "faces 3"]]:
-    """Each edge once, and the three of each face, from corner 0 to 1, 1 to 2, 2 to 0."""
+    """Unique edges, and the three edge indices of each face, from corner 0 to 1, 1 to 2, 2 to 0."""
     pairs = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1).astype(np.int64)
     base = int(faces.max()) + 1
     keys, inverse = np.unique(pairs[:, 0] * base + pairs[:, 1], return_inverse=True)
@@ -91,12 +90,12 @@ def _split(
     of_face: Int[np.ndarray, "faces 3"],
     split: Bool[np.ndarray, " edges"],
 ) -> tuple[Float[np.ndarray, "more 3"], Carrier]:
-    """One round: a vertex in the middle of every edge that is to be split."""
+    """One round: insert a vertex in the middle of every edge to split."""
     new_vertex = np.full(len(edges), -1)
     new_vertex[split] = len(vertices) + np.arange(split.sum())
     middles = _middles(vertices, outward, edges[split])
 
-    # The same for the file's rows: at a seam an edge has one middle for each side.
+    # Likewise for the file's rows: a seam edge has one midpoint per side.
     row_edges, of_corner = _edges(carrier.corners)
     vertex_edge = np.empty(len(row_edges), dtype=np.int64)
     vertex_edge[of_corner.ravel()] = of_face.ravel()
@@ -127,11 +126,11 @@ def _split(
 def _cut(
     corners: Int[np.ndarray, "faces 3"], middle: Int[np.ndarray, "faces 3"]
 ) -> tuple[Int[np.ndarray, "more 3"], Int[np.ndarray, " more"]]:
-    """Faces cut at the middles of their edges (-1 where an edge stays whole), and which face each
-    comes from, in the order of these."""
+    """Split faces at the midpoints of their edges (-1 for unsplit edges); also return the original
+    face of each, in order."""
     found, parents = [], []
     count = (middle >= 0).sum(axis=1)
-    # Turned so that the edges to be cut, or the one not to be, come first.
+    # Rotate so that the edges to split, or the one not to split, come first.
     first = np.where(count == 1, (middle >= 0).argmax(1), (middle < 0).argmin(1))
     first = np.where(count == 2, ((middle < 0).argmax(1) + 1) % 3, first)
     turn = (first[:, None] + np.arange(3)) % 3
@@ -158,7 +157,7 @@ def _middles(
     faces: Int[np.ndarray, "faces 3"],
     edges: Int[np.ndarray, "edges 2"],
 ) -> Float[np.ndarray, "edges 3"]:
-    """Points half way along the edges' curves."""
+    """Midpoints of the edges' curves."""
     normals = vertex_normals(vertices, faces)
     a, b = edges.T
     along = vertices[b] - vertices[a]
@@ -172,7 +171,7 @@ def _middles(
 def _smooth(
     vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray
 ) -> Bool[np.ndarray, " vertices"]:
-    """Whether all faces at a vertex look the way that it does, and it is on no boundary."""
+    """Whether all faces at a vertex agree with its normal, and it isn't on a boundary."""
     corners = [vertices[faces[:, k]] for k in range(3)]
     flat = np.cross(corners[1] - corners[0], corners[2] - corners[0])
     length = np.linalg.norm(flat, axis=1, keepdims=True)
@@ -188,7 +187,7 @@ def _smooth(
 
 
 def _halves(a: np.ndarray, b: np.ndarray) -> Callable[[np.ndarray | None], np.ndarray | None]:
-    """A column of rows with the means of some pairs of them at its end; the type is kept."""
+    """Return a function that appends the means of row pairs to a column, keeping its dtype."""
 
     def extended(column: np.ndarray | None) -> np.ndarray | None:
         if column is None:
@@ -207,7 +206,7 @@ def _given(column: np.ndarray | None) -> np.ndarray:
 
 
 def _ply_alone(carrier: Carrier) -> str:
-    """What of a PLY file's tables is in no other column."""
+    """Data of a PLY file that only its own tables hold."""
     vertex = [each for each in carrier.ply.own if each not in carrier.attributes
               and each[:-1].removesuffix("_") not in carrier.attributes]  # fmt: skip
     parts = [

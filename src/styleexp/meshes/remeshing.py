@@ -1,4 +1,4 @@
-"""Coarse meshes made dense enough to be displaced."""
+"""Remesh coarse meshes densely enough for displacement."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from styleexp.meshes.welding import torn
 
 
 def remesh(mesh: Mesh, target_vertices: int) -> Mesh:
-    """Make a coarse mesh dense: about ``target_vertices`` even triangles' vertices on its surface.
+    """Remesh a coarse mesh to about ``target_vertices`` vertices of uniform triangles.
 
-    Botsch and Kobbelt's remesher from gpytoolbox, the surface re-projected onto the input. A mesh
-    that already has as many vertices comes back as it is. One that the remesher cannot take
-    (non-manifold, or it fails) is divided uniformly instead, each face into four, until it has as
-    many. Either way ``repairs`` says what was done; attributes, materials and parts are lost.
+    Uses Botsch and Kobbelt's remesher from gpytoolbox, which projects onto the input. A mesh with
+    enough vertices is returned unchanged. If the remesher can't handle the mesh (non-manifold, or
+    it fails), each face is subdivided into four until there are enough vertices. ``repairs`` says
+    what was done. Attributes, materials and parts are lost.
     """
     before = len(mesh.vertices)
     if before >= target_vertices:
@@ -51,8 +51,8 @@ def remesh(mesh: Mesh, target_vertices: int) -> Mesh:
 
 
 def resample(mesh: Mesh, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of an even mesh of about ``count`` vertices on the mesh's surface, whether
-    it has more or fewer. Raises `UserError` where the remesher can't take it."""
+    """Resample a mesh, up or down, to about ``count`` uniform vertices; return vertices and faces.
+    Raises `UserError` if the remesher can't handle it."""
     frame = normalisation(mesh.vertices)
     points = frame.apply(mesh.vertices)
     reason = unfit(points, mesh.faces)
@@ -66,13 +66,13 @@ def resample(mesh: Mesh, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def unfit(points: np.ndarray, faces: np.ndarray) -> str | None:
-    """Why the remesher, which trusts its input, must not be given this mesh."""
+    """Why the remesher, which doesn't validate its input, can't be used on this mesh."""
     mesh = trimesh.Trimesh(points, faces, process=False)
     if np.unique(mesh.edges_sorted, axis=0, return_counts=True)[1].max() > 2:
         return "it is not manifold (an edge has more than two faces)"
     if (face_areas(points, faces) < 1e-14).any():
         return "it has degenerate faces"
-    # The faces around a vertex must be one fan: corners that share an edge are joined.
+    # The faces around a vertex must form a single fan: join corners that share an edge.
     ends = mesh.face_adjacency_edges[:, :, None]
     f, g = (
         3 * face[:, None] + (faces[face][:, None] == ends).argmax(axis=2)
@@ -88,7 +88,7 @@ def unfit(points: np.ndarray, faces: np.ndarray) -> str | None:
 def _botsch(
     points: np.ndarray, faces: np.ndarray, target: int
 ) -> tuple[np.ndarray, np.ndarray, bool] | None:
-    """Vertices, faces and whether creases were kept; None where the remesher fails."""
+    """Vertices, faces and whether creases were kept; None if the remesher fails."""
     import gpytoolbox
 
     def run(length: float, creases: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -105,7 +105,7 @@ def _botsch(
             raise ValueError("nothing left")
         return np.asarray(vertices, dtype=np.float64), np.asarray(new_faces, dtype=np.int64)
 
-    # Even triangles of edge h: area sqrt(3)/4 h² each, half as many vertices as faces.
+    # Uniform triangles of edge h: area sqrt(3)/4 h² each, half as many vertices as faces.
     length = float(np.sqrt(2.0 * face_areas(points, faces).sum() / (np.sqrt(3.0) * target)))
     try:
         best, result = length, run(length, False)
@@ -113,14 +113,16 @@ def _botsch(
             ratio = len(result[0]) / target
             if 0.9 < ratio < 1.1:
                 break
-            # Edges from 4/5 to 4/3 of the length stay: near the input's own it reacts little.
+            # Edges of 4/5 to 4/3 of the target length stay, so near the input's own it changes
+            # little.
             length *= ratio**0.75
             other = run(length, False)
             if abs(np.log(len(other[0]) / target)) < abs(np.log(ratio)):
                 best, result = length, other
-    except Exception:  # of several kinds; the caller subdivides instead and says so
+    except Exception:  # several kinds; the caller subdivides instead and says so
         return None
-    # Kept creases suit machined shapes; on organic ones they often cost slivers or many vertices.
+    # Preserving creases suits machined shapes; on organic ones it often costs slivers or many
+    # vertices.
     with contextlib.suppress(Exception):
         creased = run(best, True)
         areas = face_areas(*creased)

@@ -1,4 +1,4 @@
-"""From a file's rows to a checked, welded, outward mesh."""
+"""Convert a file's rows to a validated, welded, outward-facing mesh."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from styleexp.meshes import joining
 from styleexp.meshes.mesh import Carrier, Mesh, face_areas
 
 LEAST = 1e-9
-"""Of the extent: what is nearer is the same even in a file of doubles, whose coordinates a node's
-transform or an exporter has rounded on the way."""
+"""Merge distance for double-precision files, as a fraction of the extent; accounts for rounding by
+node transforms and exporters."""
 GAP = 1e-4
-"""Of the extent: open edges that lie nearer to each other were hardly meant to be open."""
+"""Open edges closer than this fraction of the extent were probably not meant to be open."""
 
 
 def plural(count: int, one: str, many: str) -> str:
@@ -24,12 +24,12 @@ def plural(count: int, one: str, many: str) -> str:
 
 
 def check_indices(corners: np.ndarray, count: int) -> None:
-    """Raise unless all corners are among ``count`` vertices."""
+    """Raise `UserError` if a corner refers to a vertex beyond ``count``."""
     bad = corners[(corners < 0) | (corners >= count)]
     if bad.size:
         raise UserError(
-            f"has a face that refers to vertex {bad.flat[0]} (from 0), but there are only {count} "
-            "vertices: export the mesh again."
+            f"has a face that refers to vertex {bad.flat[0]} (counted from 0), but there are only "
+            f"{count} vertices: export the mesh again."
         )
 
 
@@ -40,16 +40,16 @@ def weld(
     notes: list[str],
     distance: float | None = None,
 ) -> Mesh:
-    """One vertex per position of the rows at ``points`` (rows, 3); ``carrier.rows`` is filled in.
+    """Merge the rows at ``points`` (rows, 3) to one vertex per position; sets ``carrier.rows``.
 
-    Rows at the same position are one vertex; along open edges those within ``distance``, too, in
-    the file's units, by default what its numbers can't tell apart (`joining.near`).
+    Coincident rows become one vertex; on open edges, so do rows within ``distance``, in the file's
+    units, by default the file's numeric precision (`joining.near`).
 
-    Raises `UserError` with the end of a sentence that begins with the file's name.
+    Raises `UserError` with a message that lacks its subject, the file's name.
     """
     points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     if len(carrier.corners) == 0:
-        what = "is a point cloud" if len(points) else "holds no mesh"
+        what = "is a point cloud" if len(points) else "contains no mesh"
         raise UserError(f"{what}: it has no faces; reconstruct or export a surface first.")
     infinite = int((~np.isfinite(points).all(axis=1)).sum())
     if infinite:
@@ -59,13 +59,15 @@ def weld(
         )
     extent = float(np.ptp(points, axis=0).max())
     if extent <= 0.0:
-        raise UserError("has no extent, all its vertices coincide: export it again, uncompressed.")
-    if not 1e-100 < extent < 1e100:  # beyond, squares of coordinates vanish or overflow
-        raise UserError(f"measures {extent:g}, too little or too much: scale the mesh.")
+        raise UserError("has no extent: all its vertices coincide; export it again, uncompressed.")
+    if not 1e-100 < extent < 1e100:  # outside, squared coordinates underflow or overflow
+        raise UserError(
+            f"has an extent of {extent:g}, which is too small or too large: scale the mesh."
+        )
     if np.abs(points).max() > 1e3 * extent:
-        notes.append("lies far from the origin, where PLY and GLB round coordinates; OBJ does not")
+        notes.append("is far from the origin, where PLY and GLB round coordinates; OBJ does not")
 
-    # First appearance gives a vertex its place and position, so an order without duplicates stays.
+    # The first occurrence determines a vertex's index and position, so that order is preserved.
     first, rows = joining.exact(points)
     reach = max(LEAST * extent, carrier.precision) if distance is None else distance
     owner = joining.near(points[first], rows[carrier.corners], reach)
@@ -74,7 +76,7 @@ def weld(
         kept, place = np.unique(owner, return_inverse=True)
         first, rows = first[kept], place[rows]
         number = plural(joined, "vertex", "vertices")
-        notes.append(f"joined {number} within {reach:.2g} of others along open edges")
+        notes.append(f"merged {number} within {reach:.2g} of others on open edges")
     vertices = points[first]
     file_faces = rows[carrier.corners]
     if told := torn(vertices, file_faces):
@@ -83,7 +85,7 @@ def weld(
     unit = (vertices - vertices.mean(axis=0)) / extent
     degenerate = int((face_areas(unit, file_faces) <= 1e-20).sum())
     if degenerate == len(file_faces):
-        raise UserError("has only degenerate faces, without any area: export the mesh again.")
+        raise UserError("has only degenerate, zero-area faces: export the mesh again.")
     if degenerate:
         number = plural(degenerate, "degenerate face", "degenerate faces")
         notes.append(f"ignored {number} for the normals")
@@ -98,7 +100,7 @@ def weld(
 
 
 def torn(vertices: np.ndarray, faces: np.ndarray) -> str:
-    """One sentence on open edges that nearly coincide, empty where there are none."""
+    """One sentence on open edges that nearly coincide; empty if there are none."""
     extent = float(np.ptp(vertices, axis=0).max())
     count, gap = joining.nearly_closed(vertices, faces, GAP * extent)
     if not count:
@@ -107,14 +109,14 @@ def torn(vertices: np.ndarray, faces: np.ndarray) -> str:
     wide = np.ceil(gap * 1.01 / unit) * unit  # two digits, rounded up
     return (
         f"{plural(count, 'open edge nearly coincides', 'open edges nearly coincide')} with others, "
-        f"up to {gap:.2g} apart: source.weld={wide:g} joins them"
+        f"up to {gap:.2g} apart: source.weld={wide:g} merges them"
     )
 
 
 def _inside_out(points: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.ndarray:
-    """Which faces to turn so that components agree with themselves and, if closed, face outwards.
+    """Which faces to flip so that components are consistent and, if closed, face outwards.
 
-    trimesh's ``fix_winding`` follows one face of each component; here the majority decides.
+    Follows the majority of each component, whereas trimesh's ``fix_winding`` follows one face.
     """
     n = len(faces)
     mesh = trimesh.Trimesh(points, faces, process=False)
@@ -126,8 +128,8 @@ def _inside_out(points: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.n
         at = (faces[face] == shared[:, :1]).argmax(axis=1)
         return faces[face, (at + 1) % 3] == shared[:, 1]
 
-    # Each face twice, as it is and turned: neighbours are joined the way that makes them agree.
-    # Components of this graph come in mirror pairs unless the surface is one-sided.
+    # Two nodes per face, original and flipped; edges connect consistent neighbours. Components of
+    # this graph come in mirrored pairs unless the surface is one-sided.
     agree = forward(f) != forward(g)
     pairs = [
         np.stack([f, np.where(agree, g, g + n)], axis=1),
@@ -141,7 +143,7 @@ def _inside_out(points: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.n
     remark = " (saved files keep the input's winding)"
     if flipped.any():
         number = plural(int(flipped.sum()), "face", "faces")
-        notes.append(f"turned {number} that disagreed with their neighbours{remark}")
+        notes.append(f"flipped {number} inconsistent with their neighbours{remark}")
 
     agreed = np.where(flipped[:, None], faces[:, ::-1], faces)
     mesh = trimesh.Trimesh(points, agreed.copy(), process=False)
@@ -149,5 +151,5 @@ def _inside_out(points: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.n
     inward = (mesh.faces != agreed).any(axis=1)
     if inward.any():
         which = "the mesh" if inward.all() else plural(int(inward.sum()), "face", "faces")
-        notes.append(f"turned {which} inside out, because the faces pointed inwards{remark}")
+        notes.append(f"flipped {which}, because the faces pointed inwards{remark}")
     return flipped ^ inward

@@ -1,4 +1,4 @@
-"""Whether a file is all there, before trimesh, which reads what there is, gets it."""
+"""Detect truncated files, which trimesh would read without an error."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ EARLY = "ends too early: copy or export the mesh again."
 
 
 def check(kind: str, data: bytes) -> None:
-    """Raise `UserError`, the end of a sentence that begins with the file's name, unless it is."""
+    """Raise `UserError` if the file is truncated; the message lacks its subject, the file's
+    name."""
     if kind == "stl":
         _stl(data)
     elif kind == "off":

@@ -1,4 +1,4 @@
-"""Meshes to files: the moved vertices in the file's own rows, materials and nodes."""
+"""Save meshes: moved vertices in the original file's rows, materials and nodes."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ def save_mesh(
     path: str | os.PathLike[str],
     displacement: Float[np.ndarray, " vertices"] | None = None,
 ) -> None:
-    """Write a mesh with its vertices moved, as PLY (binary), OBJ or GLB by ``path``'s extension.
+    """Write a mesh with moved vertices, as PLY (binary), OBJ or GLB by ``path``'s extension.
 
-    ``vertices`` replace `Mesh.vertices`, in the same frame. The file's own rows come back: texture
-    coordinates with their seams, materials and images, colours, part names, winding. A GLB gets
-    normals, computed anew, with the hard edges of a glTF input.
+    ``vertices`` replace `Mesh.vertices`, in the same frame. The input file's rows are preserved:
+    texture coordinates with their seams, materials and images, colours, part names, winding. A GLB
+    gets recomputed normals, with the hard edges of a glTF input.
 
-    - PLY: one object without textures; ``displacement`` is its float vertex property. A PLY file's
-      own properties come back, in its types.
-    - OBJ: faces and materials in the file's order. Materials and images are written beside it,
+    - PLY: one object without textures; ``displacement`` is a float vertex property. A PLY input's
+      own properties are preserved, in their types.
+    - OBJ: faces and materials in the file's order. Materials and images are written next to it,
       named after it: ``out.obj``, ``out.mtl``, ``out_wood.png``.
-    - GLB: a glTF file's own document, with new positions, their normals (where it has some) and
-      without their tangents; otherwise a node for each part. ``displacement`` is the custom
-      attribute ``_DISPLACEMENT``, in the mesh's own units whatever the nodes' scale.
+    - GLB: a glTF input's own document, with new positions and normals (if it has normals) and
+      without tangents; otherwise one node per part. ``displacement`` is the custom attribute
+      ``_DISPLACEMENT``, in the mesh's own units regardless of node scales.
 
-    PLY and GLB hold single precision, but a PLY whose source has doubles holds doubles. Every file
-    is replaced in one step, so an interrupted run leaves no half of one. Raises `UserError` if the
-    place cannot be written, the extension is unknown or values are not finite.
+    PLY and GLB use single precision, but a PLY whose source has doubles uses doubles. Every file is
+    replaced atomically, so an interrupted run leaves no partial files. Raises `UserError` if the
+    path isn't writable, the extension is unknown or values are not finite.
     """
     path = Path(path)
     kind = path.suffix.lower()
@@ -53,17 +53,17 @@ def save_mesh(
     if vertices.shape != mesh.vertices.shape:
         raise ValueError(f"expected vertices of shape {mesh.vertices.shape}, got {vertices.shape}")
     if displacement is not None and np.shape(displacement) != (len(vertices),):
-        raise ValueError(f"expected {len(vertices)} displacements, not {np.shape(displacement)}")
+        raise ValueError(f"expected {len(vertices)} displacements, got {np.shape(displacement)}")
     if not np.isfinite(vertices).all():
         raise UserError(
-            f"'{path}' was not written, the result has NaN or infinite vertices: the run diverged, "
-            "lower the learning rate."
+            f"'{path}' was not written: the result has NaN or infinite vertices because the run "
+            "diverged; lower the learning rate."
         )
     if kind not in (".ply", ".obj", ".glb"):
-        raise UserError(f"'{path}' cannot be written: supported are .ply, .obj, .glb.")
+        raise UserError(f"'{path}' cannot be written: supported formats are .ply, .obj, .glb.")
     if kind != ".obj" and np.abs(vertices).max() > np.finfo(np.float32).max:
         raise UserError(
-            f"'{path}' cannot hold such large coordinates: save as OBJ or scale the mesh down."
+            f"'{path}' cannot store such large coordinates: save as OBJ or scale the mesh down."
         )
     carrier = mesh.carrier or Carrier(
         mesh.faces, np.arange(len(vertices)), np.zeros(len(mesh.faces), bool), parts=(mesh.name,)
@@ -85,14 +85,14 @@ def save_mesh(
         files = {path.name: content}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        for name, content in files.items():  # the mesh comes last, when all it needs is there
+        for name, content in files.items():  # write the mesh last, after the files it refers to
             atomic.write(path.with_name(name), atomic.data(content))
     except OSError as error:
         raise UserError(f"'{path}' cannot be written ({error.strerror or error}).") from None
 
 
 def _row_normals(carrier: Carrier, vertices: np.ndarray) -> np.ndarray:
-    """Unit normals (rows, 3), smooth across the corners that the file's normals call smooth."""
+    """Unit normals (rows, 3), smooth across corners that the file's normals mark as smooth."""
     groups = carrier.rows
     if carrier.normals is not None:
         rounded = np.round(np.nan_to_num(carrier.normals) * 50)
@@ -102,21 +102,21 @@ def _row_normals(carrier: Carrier, vertices: np.ndarray) -> np.ndarray:
 
 
 def _distinct(*columns: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Distinct combinations of rows: the first row of each, and each row's combination."""
+    """Distinct combinations of column values: the first row of each, and each row's combination."""
     table = np.column_stack([column for column in columns if column is not None])
     _, first, inverse = np.unique(table, axis=0, return_index=True, return_inverse=True)
     return first, inverse.ravel()
 
 
 def ply_rows(carrier: Carrier) -> tuple[np.ndarray, np.ndarray]:
-    """The rows that a PLY file gets, in its order, and which of them each row became."""
+    """The rows written to a PLY file, in order, and the index among them of each original row."""
     if carrier.ply is not None and carrier.ply.rows:
         return np.arange(len(carrier.rows)), np.arange(len(carrier.rows))
     return _distinct(carrier.rows, carrier.uv, carrier.colors, *carrier.attributes.values())
 
 
 def _runs(carrier: Carrier, *more: np.ndarray) -> Iterator[tuple[int, int, np.ndarray]]:
-    """Part, material (-1 for none) and faces, wherever one of them (or of ``more``) changes."""
+    """Yield runs of faces with equal part, material (-1 for none) and values of ``more``."""
     n = len(carrier.corners)
     part = np.zeros(n, dtype=np.int64) if carrier.face_part is None else carrier.face_part
     material = np.full(n, -1) if carrier.face_material is None else carrier.face_material
@@ -135,7 +135,7 @@ def _ply(
     if carrier.ply is not None:
         moved = (vertices != mesh.vertices).any(axis=1)
         own = np.stack([carrier.ply.vertex[name] for name in "xyz"], axis=1)[first]
-        # Rows that were welded and did not move are where they were, to the last bit.
+        # Welded rows that did not move keep their exact positions.
         points = np.where(moved[rows][:, None], points, own)
         if carrier.normals is not None:
             near = np.zeros(len(vertices), dtype=bool)
@@ -168,7 +168,7 @@ def _obj(carrier: Carrier, mesh: Mesh, vertices: np.ndarray, path: Path) -> dict
         mtl = MAP.sub(lambda m: f"{m[1]}{beside[m[2]]}" if m[2] in beside else "", mtl)
         files[f"{path.stem}.mtl"] = mtl.encode()
 
-    # The whole mesh's vertices in their order, unless colours have seams.
+    # All vertices in order, unless colours have seams.
     index, table = carrier.rows, vertices
     moved = (vertices != mesh.vertices).any(axis=1)
     if carrier.shades is not None:
@@ -190,7 +190,7 @@ def _obj(carrier: Carrier, mesh: Mesh, vertices: np.ndarray, path: Path) -> dict
         words.append(index + 1)
     corner = ["/".join(map(str, row)) for row in np.stack(words, axis=1).tolist()]
 
-    # What the faces before have is said once.
+    # Only write what changes between faces.
     said: dict[str, int] = {}
     texts = {"o": carrier.parts, "usemtl": tuple(names)} | {
         word: label for word, (label, _) in carrier.labels.items()
@@ -210,7 +210,8 @@ def _obj(carrier: Carrier, mesh: Mesh, vertices: np.ndarray, path: Path) -> dict
 
 
 def _line(word: str, numbers: list[float], digits: int) -> str:
-    """The numbers that aren't NaN, with as many digits; with 17 exactly, as shortly as can be."""
+    """Format a line of the numbers that aren't NaN with this many digits; with 17, shortest exact
+    form."""
     known = [x for x in numbers if x == x]
     if digits >= 17:
         return " ".join([word, *map(repr, known)])
@@ -218,7 +219,7 @@ def _line(word: str, numbers: list[float], digits: int) -> str:
 
 
 def _mtl(carrier: Carrier, names: list[str]) -> tuple[str, dict[str, bytes]]:
-    """A material library and the images it names."""
+    """Make a material library and the images it names."""
     texts, textures = [], {}
     for material, name in zip(carrier.materials, names, strict=True):
         simple = material.to_simple()

@@ -1,6 +1,6 @@
-"""What a result is worth: metrics that were themselves tested on known answers (docs/metrics.md).
+"""Quality metrics of a result, validated on known answers (docs/metrics.md).
 
-``measure`` is what every finished run is measured with.
+Every finished run is measured with ``measure``.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Judge:
-    """An encoder that measures results, and what it remembers of the styles it saw."""
+    """An encoder that measures results, with a cache of measured styles."""
 
     name: str
     encoder: Encoder
@@ -44,11 +44,11 @@ class Judge:
         self.plain = judged_plain(self.encoder)
 
     def looks(self, config: Config, relief: Relief, unit: float) -> Looks:
-        """What a result's relief looks like, at places that its run's seed doesn't choose."""
+        """Features of a result's relief, at positions independent of the run's seed."""
         return judged(relief, unit, self.encoder, self.windows, seed=config.optim.seed)
 
     def style(self, config: Config, style: meshes.Mesh | np.ndarray, unit: float) -> Looks:
-        """What the style looks like; measured once for each style and size."""
+        """Features of the style, cached per style and size."""
         picture = isinstance(style, np.ndarray) and (unit, config.baseline is None)
         key = (repr(config.style), config.loss.target, picture)
         if key not in self.styles:
@@ -57,14 +57,15 @@ class Judge:
 
 
 def judge_name(name: str, trained: str | None) -> str | None:
-    """``auto`` is an encoder that the run was not ``trained`` with; ``none`` is None."""
+    """Resolve ``auto`` to an encoder other than ``trained``, the run's own, and ``none`` to
+    None."""
     if name == "auto":
         return "vgg16" if trained == "vgg16_edges" else "vgg16_edges"
     return None if name == "none" else name
 
 
 def load_judge(name: str | None, windows: int) -> Judge | None:
-    """The judge of that name. Downloads its weights where they aren't here yet."""
+    """Load the judge of that name; downloads its weights if needed."""
     from styleexp.encoders import load_encoder
 
     return None if name is None else Judge(name, load_encoder(name), windows)
@@ -78,12 +79,13 @@ def measure(
     faces: Int[np.ndarray, "faces 3"],
     judge: Judge | None,
 ) -> dict[str, float]:
-    """All metrics of a result in its source's frame; without a judge, those that need none.
+    """All metrics of a result in its source's frame; without a judge, only those that don't need
+    one.
 
-    ``style_distance`` 0 is the style itself, 1 no style at all (``metrics.style``);
-    ``relief_distance`` compares without a neural network; ``relief_rms`` is in radii of the
-    normalised source, ``relief_share`` its ratio to the style mesh's own. The content metrics are
-    ``metrics.shape``'s.
+    ``style_distance`` is 0 for the style itself and 1 for no style at all (``metrics.style``).
+    ``relief_distance`` compares without a neural network. ``relief_rms`` is in radii of the
+    normalised source, and ``relief_share`` is its ratio to the style mesh's. For the content
+    metrics, see ``metrics.shape``.
     """
     unit = pattern_unit(config.style, source, style if isinstance(style, meshes.Mesh) else None)
     found: dict[str, float] = {}
@@ -106,7 +108,8 @@ def measure(
 
 
 def _moved(source: meshes.Mesh, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """How far each vertex lies from where it was, or from the source's surface."""
+    """Signed distance of each vertex from its source position or, with other faces, from the
+    source's surface."""
     base = source.vertices
     if not np.array_equal(faces, source.faces):
         base, _ = closest(source.vertices, source.faces, vertices)

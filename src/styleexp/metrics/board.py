@@ -1,4 +1,4 @@
-"""Metrics of finished runs, one folder or many, read from what the runs saved."""
+"""Measure finished runs, one or many, from their saved files."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ if TYPE_CHECKING:
 
 
 def measure_run(folder: Path, judge: Judge | None) -> dict[str, float]:
-    """The metrics of a finished run, measured anew from ``result.ply``.
+    """Measure a finished run again, from its ``result.ply``.
 
-    Raises `UserError` for a folder that is no run's, or whose run isn't done.
+    Raises `UserError` if the folder isn't a run's, or its run isn't done.
     """
     _, config, source, style, vertices, faces = _finished(folder)
     return measure(config, source, style, vertices, faces, judge)
 
 
 def measure_board(folder: Path, judge: Judge, write: bool = False) -> dict[str, Any]:
-    """Every run below ``folder``, and how well their styles can be told apart.
+    """Measure every run below ``folder``, and how well their styles can be identified.
 
-    With ``write`` each run's ``metrics.json`` is replaced by what was measured now.
+    With ``write``, replace each run's ``metrics.json`` by the new values.
 
-    ``identification`` counts the runs whose result looks nearest to their own style among all
-    styles of the board of its kind, meshes or pictures, whose heights are known otherwise (by
-    `relief_distance`; ``identification_features`` is the same by what `style_distance` compares);
-    ``of`` is how many runs were done. Those that weren't are listed as such.
+    ``identification`` counts the runs whose result is nearest to its own style among all styles on
+    the board of the same kind (meshes or images), by `relief_distance`; ``identification_features``
+    is the same by the features of `style_distance`. ``of`` is the number of finished runs.
+    Unfinished runs are listed as such.
     """
     rows: list[dict[str, Any]] = []
     results: list[tuple[dict[str, Any], Looks]] = []
@@ -48,7 +48,7 @@ def measure_board(folder: Path, judge: Judge, write: bool = False) -> dict[str, 
     contents: dict[str, str] = {}
     runs = sorted((path.parent for path in folder.rglob("run.json")), key=lambda p: str(p))
     if not runs:
-        raise UserError(f"'{folder}' holds no run: give a run's or a sweep's folder.")
+        raise UserError(f"'{folder}' contains no run: give a run's or a sweep's folder.")
     for run in runs:
         row: dict[str, Any] = {"run": str(run.relative_to(folder))}
         rows.append(row)
@@ -84,9 +84,9 @@ def measure_board(folder: Path, judge: Judge, write: bool = False) -> dict[str, 
 
 
 def _style_name(record: dict[str, Any], contents: dict[str, str]) -> str:
-    """The style's name as it was typed; files of one name and different content are told apart.
+    """The style's name as typed, made unique among files with the same name and different content.
 
-    ``contents`` holds the content of every name so far, and is added to.
+    ``contents`` maps the names so far to their content, and is updated.
     """
     typed = record["config"]["style"]
     content = str(((record.get("assets") or {}).get("style") or {}).get("sha256"))
@@ -97,28 +97,29 @@ def _style_name(record: dict[str, Any], contents: dict[str, str]) -> str:
 def nearest(
     looks: Looks, style: str, goals: dict[str, Looks], distance: Callable[[Looks, Looks], float]
 ) -> str:
-    """The style of the same kind as ``style``, mesh or picture, that the result looks most like."""
+    """The style nearest to the result, among those of the same kind (mesh or image) as
+    ``style``."""
     is_picture = goals[style].height is None
     rivals = [name for name, goal in goals.items() if (goal.height is None) == is_picture]
     return min(rivals, key=lambda name: distance(looks, goals[name]))
 
 
 def relief_apart(result: Looks, style: Looks) -> float:
-    """`relief_distance`, which recognises most of the imperfect results on the truth boards;
-    infinite where no window was seen."""
+    """`relief_distance`, which identifies most of the imperfect results on the truth boards;
+    infinite if there is no window."""
     apart = relief_distance(result, style)
     return math.inf if apart is None else apart
 
 
 def unit_of(config: Config, source: meshes.Mesh, style: meshes.Mesh | np.ndarray) -> float:
-    """The pattern's size on the normalised source."""
+    """Size of a unit pattern on the normalised source."""
     return pattern_unit(config.style, source, style if isinstance(style, meshes.Mesh) else None)
 
 
 def _finished(
     folder: Path,
 ) -> tuple[dict[str, Any], Config, meshes.Mesh, meshes.Mesh | np.ndarray, np.ndarray, np.ndarray]:
-    """Record, configuration, source, style and result of a run that is done."""
+    """Record, configuration, source, style and result of a finished run."""
     record = records.read_record(folder, "measure")
     try:
         status = json.loads((folder / "status.json").read_text(encoding="utf-8"))["status"]
@@ -132,10 +133,10 @@ def _finished(
 
 
 def read_result(path: Path, source: meshes.Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of a result's file, with the source's own numbering where they are its.
+    """Vertices and faces of a result's file, in the source's numbering if the topology matches.
 
-    A file may hold the source's vertices, or its file's rows, in which vertices are split at seams;
-    anything else is another topology and is taken as it stands.
+    A file may contain the source's vertices, or its file's rows, with vertices split at seams.
+    Anything else has another topology and is returned as is.
     """
     result = meshes.load_mesh(path)
     if len(result.vertices) == len(source.vertices) and len(result.faces) == len(source.faces):
@@ -152,7 +153,7 @@ def read_result(path: Path, source: meshes.Mesh) -> tuple[np.ndarray, np.ndarray
 
 
 def _rows(path: Path) -> np.ndarray:
-    """Vertices in the order of the file."""
+    """Vertices in file order."""
     if path.suffix.lower() == ".ply":
         from styleexp.meshes.ply import numbers, parse
 

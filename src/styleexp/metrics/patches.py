@@ -1,9 +1,9 @@
-"""A relief seen apart from the shape that it lies on: square windows of its height, laid flat.
+"""Separate a relief from its base shape: flat square windows of its height.
 
-What tells one style from another is the relief; what a render shows first is the shape below it.
-So the relief is taken off: at random points of the surface a window of the tangent plane is looked
-at from straight above, world +Y up, and at every pixel the height over the base surface is read.
-A bubble is then a bubble, on a limb as on a sphere.
+Styles differ in their relief, but renders mostly show the shape below it. So windows are sampled:
+at random surface points, a window of the tangent plane is viewed from straight above, world +Y up,
+and the height above the base surface is read at every pixel. A bubble then looks the same on a limb
+as on a sphere.
 """
 
 from __future__ import annotations
@@ -31,42 +31,43 @@ if TYPE_CHECKING:
 WINDOW = 1.0
 """Width of a window, in units of the pattern (see ``scene.pattern_unit``)."""
 SIZE = 96
-"""Pixels on a window's side."""
+"""Side of a window in pixels."""
 COARSEST = 0.5
-"""Undulations longer than about this, in the same units, belong to the shape, not to the relief."""
+"""Wavelength, in units of the pattern, above which undulations count as shape, not relief."""
 FIELD_OF_VIEW = 20.0
-"""Degrees: narrow, so that the window is nearly a parallel projection."""
+"""Field of view in degrees; narrow, for a nearly parallel projection."""
 LEAST_FACING = 0.6
-"""Cosine between the window's normal and a face's below which the face is left out: too oblique."""
+"""Cosine between the window's and a face's normal below which the face is too oblique and
+ignored."""
 DEEPEST = 0.35
-"""Faces farther than this from the window's plane, in window widths, are another part's."""
+"""Distance from the window's plane, in window widths, beyond which faces belong to another part."""
 LEAST_COVERED = 0.25
-"""Windows of which less than this share is usable are left out."""
+"""Minimum usable fraction of a window."""
 BATCH = 32
 
 
 @dataclass(frozen=True)
 class Relief:
-    """Heights over a base surface. All lengths in one unit."""
+    """Heights above a base surface, all in the same unit."""
 
     base: Float[np.ndarray, "vertices 3"]
     faces: Int[np.ndarray, "faces 3"]
     height: Float[np.ndarray, " vertices"]
-    """Along the base's normals, with mean zero."""
+    """Height along the base's normals, with zero mean."""
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Square pieces of a relief, laid flat."""
+    """Flat square windows of a relief."""
 
     height: Float[Tensor, "n size size"]
-    """In widths of the window; gaps are filled with what is around them."""
+    """Height in window widths; gaps are filled from their surroundings."""
     mask: Bool[Tensor, "n size size"]
-    """Where the height was really seen."""
+    """Pixels with a measured height."""
 
 
 def relief_of_mesh(mesh: meshes.Mesh, unit: float = 1.0) -> Relief:
-    """A mesh's relief over its own smoothed version, in the unit sphere; ``unit`` is the size of
+    """A mesh's relief above its own smoothed version, in the unit sphere; ``unit`` is the size of
     its pattern there, 1 for a style mesh."""
     vertices = meshes.normalisation(mesh.vertices).apply(mesh.vertices)
     base = smoother(vertices, mesh.faces, COARSEST * unit)(vertices)
@@ -80,11 +81,11 @@ def relief_of_result(
     faces: Int[np.ndarray, "faces 3"],
     unit: float,
 ) -> Relief:
-    """What a result adds to its source, in radii of the normalised source.
+    """The relief that a result adds to its source, in radii of the normalised source.
 
     ``vertices`` are in the source's frame. With the source's own faces, height is the vertices'
     displacement along the source's normals; otherwise their signed distance from its surface.
-    Undulations longer than the pattern's are taken off, as they are from a style mesh.
+    Undulations longer than the pattern are removed, as for a style mesh.
     """
     frame = meshes.normalisation(source.vertices)
     result, own = frame.apply(vertices), frame.apply(source.vertices)
@@ -102,7 +103,7 @@ def closest(
     faces: Int[np.ndarray, "faces 3"],
     points: Float[np.ndarray, "points 3"],
 ) -> tuple[Float[np.ndarray, "points 3"], Float[np.ndarray, "points 3"]]:
-    """The nearest point of a mesh to each of ``points``, and the smooth unit normal there."""
+    """Closest point on a mesh to each of ``points``, and the smooth unit normal there."""
     import gpytoolbox
 
     _, face, weights = gpytoolbox.squared_distance(points, vertices, faces, use_cpp=True)
@@ -114,9 +115,9 @@ def closest(
 
 
 def windows(relief: Relief, width: float, count: int, seed: int = 0) -> Windows:
-    """At most ``count`` windows, ``width`` wide, at points drawn evenly over the surface.
+    """Up to ``count`` windows of size ``width``, at points sampled uniformly on the surface.
 
-    Fewer where the surface is too small or too hidden for so many; none is an empty batch.
+    There are fewer, possibly none, if the surface is too small or too occluded.
     """
     surface = Surface(
         torch.from_numpy(relief.base).float(),
@@ -142,7 +143,7 @@ def windows(relief: Relief, width: float, count: int, seed: int = 0) -> Windows:
 def _look(
     surface: Surface, height: Tensor, cameras: Cameras, distance: float, width: float
 ) -> tuple[Float[Tensor, "n size size"], Bool[Tensor, "n size size"]]:
-    """Heights at every pixel, and where they can be trusted."""
+    """Height at every pixel, and a mask of valid pixels."""
     out = SoftRaster().render(surface.vertices, surface.faces, cameras, Shading(), (SIZE, SIZE))
     assert out.face_ids is not None
     assert out.depth is not None
@@ -164,7 +165,7 @@ def _look(
 
 
 def _unproject(cameras: Cameras, depth: Float[Tensor, "n h w"]) -> Float[Tensor, "n h w 3"]:
-    """World points at the pixels' centres."""
+    """World points at pixel centres."""
     rows, columns = depth.shape[1:]
     x = (2 * torch.arange(columns) + 1) / columns - 1
     y = 1 - (2 * torch.arange(rows) + 1) / rows
@@ -181,7 +182,7 @@ def _unproject(cameras: Cameras, depth: Float[Tensor, "n h w"]) -> Float[Tensor,
 
 
 def _filled(height: Float[Tensor, "n h w"], mask: Bool[Tensor, "n h w"]) -> Float[Tensor, "n h w"]:
-    """Gaps filled with the blurred surroundings, so that their rims make no edges."""
+    """Fill gaps with their blurred surroundings, so that their rims don't form edges."""
     known, filled = mask.clone(), torch.where(mask, height, 0.0)
     for sigma in (1.5, 4.0, 10.0):
         share = blurred(mask.float(), sigma)
@@ -193,10 +194,10 @@ def _filled(height: Float[Tensor, "n h w"], mask: Bool[Tensor, "n h w"]) -> Floa
 
 
 def blurred(images: Float[Tensor, "n h w"], sigma: float) -> Float[Tensor, "n h w"]:
-    """Gaussian blur, ``sigma`` in pixels; the border's values go on outside."""
+    """Gaussian blur with replicated borders; ``sigma`` in pixels."""
     if not len(images):
         return images
-    if sigma > 4 and min(images.shape[1:]) >= 16:  # the same at half the resolution, far cheaper
+    if sigma > 4 and min(images.shape[1:]) >= 16:  # equivalent at half resolution, far cheaper
         small = blurred(functional.avg_pool2d(images[:, None], 2)[:, 0], sigma / 2)
         size = list(images.shape[1:])
         return functional.interpolate(small[:, None], size, mode="bilinear")[:, 0]

@@ -1,4 +1,4 @@
-"""How much of the source's shape a result keeps, and whether its surface is sound."""
+"""Content metrics: preservation of the source's shape, and surface quality."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 VIEWS = tuple((elevation, azimuth) for elevation in (-20, 30) for azimuth in range(0, 360, 60))
-"""Elevation and azimuth, in degrees, of the twelve views whose silhouettes are compared."""
+"""Elevation and azimuth, in degrees, of the twelve views for silhouettes."""
 RESOLUTION = 256
 LARGE = 15
-"""Grid cells that a face may span before it is looked at by itself."""
+"""Maximum grid cells per face; larger faces are tested separately."""
 SAMPLES = 10_000
-"""Points on each surface that Chamfer and Hausdorff distances are taken from."""
+"""Sample points per surface for Chamfer and Hausdorff distances."""
 
 
 def content(
@@ -32,7 +32,7 @@ def content(
 ) -> dict[str, float]:
     """The content metrics of a result in its source's frame; see docs/metrics.md.
 
-    ``flipped_faces`` is there only where the result has the source's own faces.
+    ``flipped_faces`` is included only if the result has the source's own faces.
     """
     diagonal = float(np.linalg.norm(np.ptp(source.vertices, axis=0)))
     chamfer, hausdorff = surface_distances(source.vertices, source.faces, vertices, faces)
@@ -54,7 +54,7 @@ def silhouette_iou(
     vertices: Float[np.ndarray, "b 3"],
     faces: Int[np.ndarray, "g 3"],
 ) -> float:
-    """Intersection over union of the silhouettes, the mean over twelve views."""
+    """Silhouette IoU, averaged over twelve views."""
     frame = meshes.normalisation(source)
     one, other = (
         _silhouettes(frame.apply(v), f) for v, f in ((source, source_faces), (vertices, faces))
@@ -83,8 +83,8 @@ def surface_distances(
     vertices: Float[np.ndarray, "b 3"],
     faces: Int[np.ndarray, "g 3"],
 ) -> tuple[float, float]:
-    """Chamfer (the mean of both directions' mean distances) and Hausdorff distance of two surfaces,
-    from points spread evenly over each to the nearest point of the other, in the meshes' units."""
+    """Chamfer (mean of both directed mean distances) and Hausdorff distance of two surfaces, from
+    uniform samples on each to the closest point on the other, in the meshes' units."""
     import gpytoolbox
 
     directions = []
@@ -108,7 +108,7 @@ def _spread(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def volume(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> float:
-    """Signed volume, positive where faces wind outwards; of an open mesh, that of its cone to the
+    """Signed volume, positive for outward winding; for an open mesh, that of its cone to the
     vertices' mean."""
     a, b, c = (vertices[faces[:, k]] - vertices.mean(axis=0) for k in range(3))
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6) or math.nan
@@ -119,22 +119,22 @@ def flipped_faces(
     vertices: Float[np.ndarray, "v 3"],
     faces: Int[np.ndarray, "f 3"],
 ) -> float:
-    """Share of the faces that point away from where they pointed on the source."""
+    """Fraction of faces whose normal opposes that on the source."""
     before, after = (_face_vectors(v, faces) for v in (source, vertices))
     return float(((before * after).sum(axis=1) < 0).mean())
 
 
 def spike(displacement: Float[np.ndarray, " vertices"]) -> float:
-    """99.9th percentile of |d| over the root mean square of d; large where few vertices stand out.
+    """99.9th percentile of |d| divided by the RMS of d; large if a few vertices stand out.
 
-    0 where nothing was displaced.
+    0 without displacement.
     """
     root = float(np.sqrt(np.square(displacement).mean()))
     return float(np.percentile(np.abs(displacement), 99.9)) / root if root > 0 else 0.0
 
 
 def self_intersections(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> float:
-    """Share of the faces that cut another one with which they share no vertex."""
+    """Fraction of faces that intersect another face without a shared vertex."""
     first, second = _near_pairs(vertices[faces])
     apart = (faces[first][:, :, None] != faces[second][:, None, :]).all(axis=(1, 2))
     first, second = first[apart], second[apart]
@@ -148,11 +148,11 @@ def self_intersections(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray
 
 
 def _near_pairs(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (i < j) of triangles (n, 3, 3) whose boxes overlap, by way of a grid."""
+    """Pairs (i < j) of triangles (n, 3, 3) with overlapping bounding boxes, found with a grid."""
     low, high = triangles.min(axis=1), triangles.max(axis=1)
     cell = max(float(np.percentile((high - low).max(axis=1), 95)), 1e-12)
     first, last = (np.floor(x / cell).astype(np.int64) for x in (low, high))
-    # A face far larger than the rest would lie in a great many cells: it meets all by itself.
+    # A face far larger than the rest would span too many cells: test it against all others.
     large = np.flatnonzero((last - first).max(axis=1) > LARGE)
     meets = [
         np.flatnonzero(
@@ -179,7 +179,7 @@ def _near_pairs(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     key = (place[:, 0] * size[1] + place[:, 1]) * size[2] + place[:, 2]
     order = np.argsort(key, kind="stable")
     key, owner = key[order], owner[order]
-    # Each entry meets those that follow it in its cell.
+    # Pair each entry with those that follow it in its cell.
     end = np.searchsorted(key, key, side="right")
     follow = end - np.arange(len(key)) - 1
     left = np.repeat(np.arange(len(key)), follow)
@@ -192,7 +192,8 @@ def _near_pairs(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _edges_cut(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Whether an edge of each triangle of ``a`` (n, 3, 3) passes through that of ``b``."""
+    """Whether an edge of each triangle in ``a`` (n, 3, 3) passes through its counterpart in
+    ``b``."""
     normal = np.cross(b[:, 1] - b[:, 0], b[:, 2] - b[:, 0])
     side = np.einsum("nij,nj->ni", a - b[:, :1], normal)
     cut = np.zeros(len(a), dtype=bool)

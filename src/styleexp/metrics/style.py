@@ -1,7 +1,7 @@
-"""How near a result's relief is to a style's: with a network's features, and without.
+"""Distance between a result's relief and a style's, with and without network features.
 
-Both look at the windows of ``patches``, so neither sees the shape below the relief. How far each
-can be trusted was measured on results with a known answer: see ``truth`` and docs/metrics.md.
+Both use the windows of ``patches``, so neither sees the base shape. Their reliability was measured
+on results with a known answer: see ``truth`` and docs/metrics.md.
 """
 
 from __future__ import annotations
@@ -29,53 +29,54 @@ if TYPE_CHECKING:
     from styleexp.losses import Grams
 
 LAYERS = ("conv3_1", "conv4_1")
-"""Shallower layers took scales for other styles on the truth board; conv5_1 has only six cells on a
-window's side."""
+"""Judging layers. Shallower ones confused scales with other styles on the truth board; conv5_1 has
+only six cells per window side."""
 RIM = 3
-"""Cells at a window's border that see the zeros beyond it, at each of these layers."""
+"""Cells at a window's border that see the zero padding, at each of these layers."""
 STYLE_WINDOWS = 48
 HEIGHT_GAIN = 5.0
-"""Grey levels per window width of height: a relief of a tenth of the window fills the range."""
+"""Grey levels per window width of height: heights within 0.1 of the mean fill the range."""
 BANDS = (1.0, 2.0, 4.0, 8.0, 16.0)
-"""Gaussian widths, in pixels, between which the bands of ``Statistics`` lie."""
+"""Gaussian widths, in pixels, that bound the bands of ``Statistics``."""
 ENERGY_WEIGHT, SKEWNESS_WEIGHT = 0.3, 0.5
-"""So that each statistic differs about as much between styles."""
+"""Weights that equalise the variation of the statistics between styles."""
 FLOOR = 1e-3
-"""Energies below this share of the style's count as this share."""
+"""Lower bound for energies, as a fraction of the style's."""
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """What filters find in a relief's windows; a value for each band, from fine to coarse.
+    """Filter statistics of a relief's windows; one value per band, from fine to coarse.
 
-    The windows are flat and small, so that bands of a planar filter stand for those of the
-    surface's Laplace-Beltrami operator.
+    The windows are flat and small, so planar filter bands approximate those of the surface's
+    Laplace-Beltrami operator.
     """
 
     energy: Float[Tensor, " bands"]
     skewness: Float[Tensor, " bands"]
-    """Above 0 for bumps, below for dents."""
+    """Skewness: positive for bumps, negative for dents."""
     upright: Float[Tensor, " bands"]
-    """From -1, where all slopes point sideways (vertical ridges), to 1 (horizontal ridges)."""
+    """Orientation, from -1 (all slopes point sideways: vertical ridges) to 1 (horizontal
+    ridges)."""
     coherence: Float[Tensor, " bands"]
-    """From 0, no direction, to 1, ridges."""
+    """Coherence, from 0 (no direction) to 1 (ridges)."""
 
 
 @dataclass(frozen=True)
 class Looks:
-    """All that is compared of one relief or picture."""
+    """All features compared for one relief or image."""
 
     shaded: Grams
     height: Grams | None = None
-    """None for a photograph: its heights are not known."""
+    """Grams of the height images; None for a photo, whose heights are unknown."""
     statistics: Statistics | None = None
-    """Of a picture with its brightness for a height, whose unit means nothing."""
+    """Filter statistics; for an image, of its brightness as a height without a unit."""
 
 
 def judged(relief: Relief, unit: float, encoder: Encoder, count: int, seed: int = 0) -> Looks:
-    """What the judge sees of a relief whose pattern has the size ``unit``, in the relief's units.
+    """Features of a relief whose pattern has the size ``unit``, in the relief's units.
 
-    No window at all, on a surface that is nowhere wide enough, gives empty Grams.
+    Grams are empty if the surface is nowhere wide enough for a window.
     """
     seen = windows(relief, WINDOW * unit, count, seed)
     found = statistics(seen) if len(seen.mask) else None
@@ -83,16 +84,16 @@ def judged(relief: Relief, unit: float, encoder: Encoder, count: int, seed: int 
 
 
 def height_grams(encoder: Encoder, seen: Windows) -> Grams:
-    """Grams of the windows as height images: grey is the mean height, white is high."""
+    """Grams of the windows as height images; grey is the mean height, white is high."""
     return grams(encoder, (0.5 + HEIGHT_GAIN * seen.height).clamp(0, 1), seen.mask)
 
 
 def judged_style(
     style: meshes.Mesh | np.ndarray, config: Config, encoder: Encoder, unit: float
 ) -> Looks:
-    """The same of the style itself. A picture is taken for a photograph of the shaded relief.
+    """Features of the style itself. An image is treated as a photo of the shaded relief.
 
-    ``unit`` is the pattern's size on the source, of which a picture's own size is a multiple.
+    ``unit`` is the pattern's size on the source; an image's size is a multiple of it.
     """
     if isinstance(style, meshes.Mesh):
         return judged(relief_of_mesh(style), 1.0, encoder, STYLE_WINDOWS)
@@ -102,7 +103,7 @@ def judged_style(
 def judged_picture(
     picture: Float[np.ndarray, "height width 3"], config: Config, span: float, encoder: Encoder
 ) -> Looks:
-    """What the judge sees of a picture whose longer side is ``span`` patterns long."""
+    """Features of an image whose longer side is ``span`` patterns long."""
     level = float(shaded(torch.zeros(1, 8, 8)).mean())
     rgb = torch.from_numpy(picture)
     heights = pictures.picture_height(config, picture)
@@ -114,7 +115,7 @@ def judged_picture(
 
     height = cut(heights.height)
     everywhere = torch.ones_like(height, dtype=torch.bool)
-    if heights.in_proportion:  # as of a mesh, in widths of the window
+    if heights.in_proportion:  # as for a mesh, in window widths
         seen = Windows(height * (span / WINDOW), everywhere)
         lit = grams(encoder, shaded(seen.height), everywhere)
         return Looks(lit, height_grams(encoder, seen), statistics(seen))
@@ -123,14 +124,14 @@ def judged_picture(
 
 
 def picture_span(config: Config, unit: float) -> float:
-    """How long a style picture's longer side is on the result, in radii: see ``styles``."""
-    if config.loss.target == "same_views":  # the picture is a whole view, as in the paper
+    """Length of a style image's longer side on the result, in radii; see ``styles``."""
+    if config.loss.target == "same_views":  # the image is a whole view, as in the paper
         return 2 * config.views.distance * math.tan(math.radians(config.views.fov) / 2)
     return config.style.image_tile * math.sqrt(4 * math.pi) * unit
 
 
 def judged_plain(encoder: Encoder) -> Looks:
-    """The same of a surface without any relief: where every source starts."""
+    """Features of a surface without relief, the start of every source."""
     flat = torch.zeros(1, SIZE, SIZE)
     everywhere = torch.ones(1, SIZE, SIZE, dtype=torch.bool)
     return Looks(
@@ -139,29 +140,29 @@ def judged_plain(encoder: Encoder) -> Looks:
 
 
 def style_distance(result: Looks, style: Looks, plain: Looks) -> float:
-    """0 for the style's own look, 1 for a surface without relief; above 1 is worse than none.
+    """0 for the style itself, 1 for a surface without relief; above 1 is worse than none.
 
-    Distance of the correlations of features of height images, over that of the plain surface. A
-    picture has no heights: against one it is `appearance_distance`, over the plain surface's.
+    Distance between feature correlations of height images, divided by that of the plain surface.
+    For a photo, which has no heights, it is `appearance_distance` divided by the plain surface's.
     """
     return pattern_distance(result, style) / pattern_distance(plain, style)
 
 
 def pattern_distance(result: Looks, style: Looks) -> float:
-    """What `style_distance` is a ratio of."""
+    """Unnormalised distance used in `style_distance`."""
     if style.height is None or result.height is None:
         return appearance_distance(result, style)
     return _apart(result.height, style.height)
 
 
 def appearance_distance(result: Looks, style: Looks) -> float:
-    """Distance of the correlations of features of shaded windows."""
+    """Distance between feature correlations of shaded windows."""
     return _apart(result.shaded, style.shaded)
 
 
 def gram_distance(result: Looks, style: Looks, plain: Looks) -> float:
-    """As `style_distance`, but of the Grams themselves, squared, as losses have it: a relief that
-    is a little too high then counts for more than one of another pattern."""
+    """Like `style_distance`, but with squared distances of the Grams themselves, as in the loss. A
+    slightly too high relief then counts more than a different pattern."""
     assert result.height is not None
     assert style.height is not None
     assert plain.height is not None
@@ -173,11 +174,11 @@ def gram_distance(result: Looks, style: Looks, plain: Looks) -> float:
 
 
 def relief_distance(result: Looks, style: Looks) -> float | None:
-    """Without a neural network: how much two reliefs' `Statistics` differ. 0 is equal.
+    """Difference of two reliefs' `Statistics`, without a neural network. 0 is equal.
 
-    Energies by the logarithm of their ratio; the rest weighted by how much of the energy is in the
-    band. A picture's brightness stands for its height, up to a factor: against it energies are
-    shares of their sum, and how high the relief is doesn't count. None where no window was seen.
+    Energies are compared by their log ratio; the rest is weighted by the band's share of the
+    energy. An image's brightness is used as its height up to a factor, so energies are normalised
+    to their sum and the height of the relief doesn't matter. None if there is no window.
     """
     if result.statistics is None or style.statistics is None:
         return None
@@ -201,7 +202,7 @@ def relief_distance(result: Looks, style: Looks) -> float | None:
 def grams(
     encoder: Encoder, grey: Float[Tensor, "n size size"], mask: Bool[Tensor, "n size size"]
 ) -> Grams:
-    """One Gram for each of ``LAYERS``, over the masked cells alone that see nothing but window."""
+    """One Gram per layer in ``LAYERS``, over masked cells that see only the window."""
     sums: list[Tensor] = []
     counts = [0.0] * len(LAYERS)
     for at in range(0, max(len(grey), 1), 16):
@@ -222,7 +223,7 @@ def grams(
 
 
 def shaded(height: Float[Tensor, "n size size"]) -> Float[Tensor, "n size size"]:
-    """The windows under the light that runs are trained under, as grey levels."""
+    """Shade the windows with the training light, as grey levels."""
     rows, columns = torch.gradient(blurred(height, 0.7) * height.shape[-1], dim=(1, 2))
     normal = functional.normalize(
         torch.stack([-columns, rows, torch.ones_like(rows)], dim=-1), dim=-1
@@ -233,7 +234,7 @@ def shaded(height: Float[Tensor, "n size size"]) -> Float[Tensor, "n size size"]
 
 
 def statistics(seen: Windows) -> Statistics:
-    """Energy, skewness and direction of the relief in each band."""
+    """Energy, skewness and direction of the relief, per band."""
     mask = seen.mask
     rest = seen.height - seen.height[mask].mean()
     rows: list[list[Tensor]] = []
@@ -252,7 +253,8 @@ def statistics(seen: Windows) -> Statistics:
 
 
 def _apart(result: Grams, style: Grams) -> float:
-    """Frobenius distance of the correlation matrices over their size, the mean over layers."""
+    """Frobenius distance of the correlation matrices divided by their size, averaged over
+    layers."""
     parts = [
         (_correlation(a) - _correlation(b)).norm() / len(a)
         for a, b in zip(result, style, strict=True)

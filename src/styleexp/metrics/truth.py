@@ -1,14 +1,14 @@
-"""The metrics' own test: results whose style is known, since it was put there by formula.
+"""Validation of the metrics on results whose style is known by construction.
 
-On every source each analytic style's relief is laid directly, at the style's own scale: from three
-sides, as one would wrap a solid, with no rendering and no learning. Beside it come distractors: the
-same style at half and at double its scale, a quarter of its height, noise of the same energy and
-frequency, the plain source, a shrunken one. A metric of style has to call the true style nearest,
-to find no style where there is none, and to prefer the right scale. What optimisation leaves is
-never the pure style: at half its height, with noise, in patches it should be recognised, too.
+Each analytic style's relief is applied directly to every source at its own scale, by triplanar
+projection, without rendering or learning. Distractors are added: the same style at half and double
+scale, at a quarter of its height, noise of the same energy and frequency, the plain source, and a
+shrunken one. A style metric must rank the true style nearest, find no style where there is none,
+and prefer the right scale. Since optimisation never yields the pure style, it should also recognise
+it at half height, with noise, and in patches.
 
-Pictures have a board of their own. What relief a picture stands for isn't known, so it is the one
-that the method takes it for: what is bright is high.
+Images have a separate board. An image's true relief is unknown, so the method's assumption is used:
+bright is high.
 """
 
 from __future__ import annotations
@@ -52,48 +52,48 @@ if TYPE_CHECKING:
     from styleexp.losses import Grams
 
 SHARPNESS = 6
-"""Exponent of the normal's components that the three projections are blended by."""
+"""Exponent of the normal's components in the blend of the three projections."""
 BELT = 0.9
-"""Radians of latitude around the style's equator that are used; mirrored beyond."""
+"""Latitude range around the style's equator, in radians; mirrored beyond."""
 SHRINKAGE = 0.03
-"""Of the shrunken source, in radii."""
+"""Shrinkage of the shrunken source, in radii."""
 PATCHES = 0.8
-"""Of a patchy result, in cycles per radius of the source; half of it is covered."""
+"""Frequency of a patchy result's patches, in cycles per radius of the source; half is covered."""
 IMPERFECT = ("low", "noisy", "patchy")
 PICTURE_RELIEF = 0.03
-"""Root mean square height of a picture that is laid on a source, in patterns."""
+"""RMS height of an image applied to a source, in pattern units."""
 PICTURE_FREQUENCY = 3.0
-"""Of the noise beside it, in cycles per pattern."""
+"""Frequency of the noise distractor, in cycles per pattern."""
 ENOUGH = 0.95
-"""Share of the cases in which a metric must be right to be kept."""
+"""Fraction of cases in which a metric must be right to be kept."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What a candidate metric may look at."""
+    """Inputs of a candidate metric."""
 
     looks: Looks
-    """By the judging encoder."""
+    """Features by the judging encoder."""
     random: Grams
-    """Of the height images, by an encoder with random weights."""
+    """Grams of the height images, by an encoder with random weights."""
     views: Grams
-    """Of whole renders, foreground alone."""
+    """Grams of whole renders, foreground only."""
 
 
 @dataclass
 class Board:
-    """Every case, measured."""
+    """All cases, measured."""
 
     styles: dict[str, Sample] = field(default_factory=dict)
     plain: Sample | None = None
     own: dict[str, Sample] = field(default_factory=dict)
-    """The plain sources."""
+    """Samples of the plain sources, by name."""
     cases: dict[tuple[str, str, str], Sample] = field(default_factory=dict)
-    """By source, style and what was put there."""
+    """Samples by source, style and variant."""
 
 
 Metric = Callable[[Sample, Sample, Sample, Sample], float]
-"""Of a result, a style, a surface without relief, and the plain source."""
+"""Distance from samples of a result, a style, a surface without relief, and the plain source."""
 
 CANDIDATES: dict[str, Metric] = {
     "style_distance": lambda r, s, p, own: style_distance(r.looks, s.looks, p.looks),
@@ -103,13 +103,13 @@ CANDIDATES: dict[str, Metric] = {
     "random_gram_distance": lambda r, s, p, own: _ratio(r.random, s.random, p.random),
     "view_distance": lambda r, s, p, own: _ratio(r.views, s.views, own.views),
 }
-"""Smaller is nearer. The last three are not used; they are here to be compared with."""
+"""Candidate metrics; smaller is nearer. The last three are only for comparison."""
 
 
 PICTURE_CANDIDATES = {
     name: CANDIDATES[name] for name in ("style_distance", "relief_distance", "appearance_distance")
 }
-"""Those that can be asked about a picture."""
+"""Candidate metrics that work for images."""
 
 
 def wrapped(
@@ -119,10 +119,10 @@ def wrapped(
     unit: float,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, " points"]:
-    """The relief of an analytic style on another surface; ``unit`` is the style's radius there.
+    """An analytic style's relief on another surface; ``unit`` is the style's radius there.
 
-    Around its equator the style's sphere is rolled out onto each of three planes, and the three
-    heights are blended by the normal; +Y stays up where it can.
+    The style's sphere is unrolled around its equator onto each of three planes, and the three
+    heights are blended by the normal; +Y stays up where possible.
     """
     weights = np.abs(normals) ** SHARPNESS
     weights /= weights.sum(axis=1, keepdims=True)
@@ -148,7 +148,7 @@ def wrapped(
 def noise(
     points: Float[np.ndarray, "points 3"], frequency: float, rng: np.random.Generator
 ) -> Float[np.ndarray, " points"]:
-    """A random field of that many cycles per unit length, root mean square 1."""
+    """A random field with this many cycles per unit length and RMS 1."""
     waves = rng.normal(size=(256, 3)) * frequency * 2 * math.pi
     total = np.cos(points @ waves.T + rng.uniform(0, 2 * math.pi, 256)).sum(axis=1)
     total -= total.mean()
@@ -158,9 +158,9 @@ def noise(
 def cases(
     source: meshes.Mesh, style: str, unit: float, frequency: float, seed: int
 ) -> Iterator[tuple[str, Float[np.ndarray, " vertices"]]]:
-    """(what it is, displacement of every vertex in radii) for a source in the unit sphere.
+    """Yield (variant, displacement of every vertex in radii) for a source in the unit sphere.
 
-    ``frequency`` is the style's, in cycles per radius of its own.
+    ``frequency`` is the style's, in cycles per radius of the style.
     """
     rng = np.random.default_rng(seed)
     normals = meshes.vertex_normals(source.vertices, source.faces)
@@ -174,7 +174,8 @@ def cases(
 def picture_cases(
     source: meshes.Mesh, picture: Float[np.ndarray, "height width 3"], unit: float, seed: int
 ) -> Iterator[tuple[str, Float[np.ndarray, " vertices"]]]:
-    """The same of a picture, its brightness for a height, projected from three sides."""
+    """Yield (variant, displacement) for an image: its brightness as height, by triplanar
+    projection."""
     rng = np.random.default_rng(seed)
     normals = meshes.vertex_normals(source.vertices, source.faces)
     height = luminance(torch.from_numpy(picture))
@@ -199,7 +200,7 @@ def _variants(
     frequency: float,
     rng: np.random.Generator,
 ) -> Iterator[tuple[str, Float[np.ndarray, " vertices"]]]:
-    """A relief, ``laid`` at its own scale, and what it must be told from."""
+    """Yield a relief, ``laid`` at its own scale, and its distractors."""
     true = laid(unit)
     yield "true", true
     yield "faint", 0.25 * true
@@ -215,7 +216,7 @@ def _variants(
 def measure_board(
     sources: list[meshes.Mesh], judge: str, count: int, told: Callable[[str], None]
 ) -> Board:
-    """Put every style on every source, with its distractors, and let the encoders look."""
+    """Apply every style to every source, with distractors, and measure with the encoders."""
     encoder = load_encoder(judge)
     random = load_encoder("vgg19_random")
 
@@ -259,7 +260,7 @@ def measure_pictures(
     count: int,
     told: Callable[[str], None],
 ) -> Board:
-    """Lay every picture on every source, with its distractors; as `measure_board`."""
+    """Apply every image to every source, with distractors; see `measure_board`."""
     encoder = load_encoder(judge)
     board, span = Board(), StyleConfig().image_tile * math.sqrt(4 * math.pi)
     for name, picture in pictures.items():
@@ -286,13 +287,13 @@ def measure_pictures(
 def judge_metrics(
     board: Board, candidates: dict[str, Metric] = CANDIDATES
 ) -> dict[str, dict[str, Any]]:
-    """How often each candidate is right, as shares of the cases.
+    """How often each candidate is right, as fractions of the cases.
 
-    ``rank1``: the true style is the nearest of all. ``scale``: the style at its own scale is nearer
-    than at half and double. ``noise``, ``strength``: nearer than noise, and than at a quarter of
-    its height. ``no_style``: the shrunken source is farther than the true result and, for the
-    metrics that are ratios, within a tenth of 1. ``imperfect``: as ``rank1``, of results at half
-    height, with noise, in patches. ``confusions`` lists what went wrong among the true ones.
+    ``rank1``: the true style is nearest. ``scale``: the style at its own scale is nearer than at
+    half and double. ``noise``, ``strength``: it is nearer than noise, and than at a quarter of its
+    height. ``no_style``: the shrunken source is farther than the true result and, for ratio
+    metrics, within a tenth of 1. ``imperfect``: like ``rank1``, for results at half height, with
+    noise, in patches. ``confusions`` lists the errors for the true style.
     """
     return {name: _verdict(metric, board) for name, metric in candidates.items()}
 
@@ -324,7 +325,7 @@ def _verdict(metric: Metric, board: Board) -> dict[str, Any]:
         nothing = far("shrunken")
         right["no_style"] += nothing > value and (not ratio or abs(nothing - 1) < 0.1)
         if nearest != style:
-            confusions.append(f"{source}: {style} taken for {nearest}")
+            confusions.append(f"{source}: {style} mistaken for {nearest}")
     shares = {key: count / len(true) for key, count in right.items()}
     shares["imperfect"] = recognised / (len(true) * len(IMPERFECT))
     kept = min(shares["rank1"], shares["scale"], shares["no_style"]) >= ENOUGH
@@ -333,7 +334,7 @@ def _verdict(metric: Metric, board: Board) -> dict[str, Any]:
 
 @torch.no_grad()
 def _view_grams(encoder: Encoder, vertices: np.ndarray, faces: np.ndarray) -> Grams:
-    """Grams of six whole views, foreground alone and eroded: what a run's loss looks at."""
+    """Grams of six whole views, foreground only and eroded, as in a run's loss."""
     azimuth = torch.arange(6) * (math.pi / 3) + 0.3
     cameras = orbit(torch.full_like(azimuth, 0.2), azimuth, 2.0, 60.0)
     shading = Shading(normals="smooth", background=0.35, outlines=False)

@@ -1,6 +1,6 @@
-"""The renderer contract: what every backend is given and what it gives back.
+"""The renderer interface: inputs and outputs of every backend.
 
-Coordinates, once and for all backends::
+Coordinate conventions, shared by all backends::
 
       world                camera (OpenGL)           NDC                    image
       +Y up                +Y up                     (-1,+1)    (+1,+1)     (0,0)────► column
@@ -12,7 +12,7 @@ Coordinates, once and for all backends::
         from +Z, +90°         the camera looks                             centre at
         from +X               along -Z                                     (c + 0.5, r + 0.5)
 
-A point ``p`` in the world is at ``q = R p + t`` in the camera and at ``x = focal_x q.x / -q.z +
+A world point ``p`` is at ``q = R p + t`` in camera space and at ``x = focal_x q.x / -q.z +
 center_x``, ``y = focal_y q.y / -q.z + center_y`` in NDC. ``w = -q.z`` is its depth, positive in
 front of the camera. Faces wind counter-clockwise seen from outside; back faces are culled.
 """
@@ -35,10 +35,10 @@ class Cameras:
     """A batch of pinhole cameras. Distances are in world units, NDC is [-1, 1] over the image."""
 
     rotation: Float[Tensor, "views 3 3"]
-    """World to camera, rows are the camera's right, up and backward axes."""
+    """World-to-camera rotation; rows are the camera's right, up and backward axes."""
     translation: Float[Tensor, "views 3"]
     focal: Float[Tensor, "views 2"]
-    """NDC per unit of tangent, (x, y): 1 / tan(half the field of view) for a centred camera."""
+    """Focal length in NDC, (x, y): 1 / tan(half the field of view) for a centred camera."""
     center: Float[Tensor, "views 2"]
     """NDC position of the optical axis, (x, y), +y up: (0, 0) unless the view is a crop."""
     near: float = 1e-2
@@ -47,7 +47,7 @@ class Cameras:
         return self.rotation.shape[0]
 
     def __getitem__(self, index: slice | Tensor) -> Cameras:
-        """The sub-batch of cameras that a slice, mask or index tensor selects."""
+        """Select cameras by a slice, mask or index tensor."""
         return Cameras(
             self.rotation[index],
             self.translation[index],
@@ -59,33 +59,33 @@ class Cameras:
 
 @dataclass(frozen=True)
 class Shading:
-    """How surfaces look; shared by all backends so that their pictures are comparable.
+    """Appearance of surfaces, shared by all backends so that their images are comparable.
 
-    Grey intensity, Text2Mesh's light: ``I = clamp(albedo (ambient + n . light), 0, 1)`` with n the
-    unit normal in *camera* space, so that the light moves with the camera.
+    Grey intensity with Text2Mesh's light: ``I = clamp(albedo (ambient + n . light), 0, 1)``, where
+    n is the unit normal in *camera* space, so the light moves with the camera.
     """
 
     albedo: float = 0.5
     ambient: float = 0.28209
     light: Float[Tensor, "views 3"] | tuple[float, float, float] = (0.48860, 0.48860, 0.48860)
-    """Camera-space direction times strength; a tensor gives each view a light of its own."""
+    """Camera-space direction times strength; a tensor sets one light per view."""
     background: float = 1.0
     normals: str = "flat"
-    """``flat`` (one normal a face) or ``smooth`` (area-weighted vertex normals, interpolated)."""
+    """``flat`` (one normal per face) or ``smooth`` (interpolated area-weighted vertex normals)."""
     outlines: bool = True
-    """Whether backends that can differentiate visibility do: outlines are then anti-aliased and
-    pull on the vertices. Without, outlines are hard and gradients are those of shading alone."""
+    """Differentiate visibility, if the backend can: outlines are anti-aliased and have gradients.
+    Otherwise outlines are hard, and only shading has gradients."""
 
 
 @dataclass(frozen=True)
 class RenderOutput:
-    """What a backend returns. Only ``image`` and ``coverage`` are promised by every backend."""
+    """Output of a backend. Only ``image`` and ``coverage`` are guaranteed."""
 
     image: Float[Tensor, "views height width channels"]
-    """In [0, 1]; one channel (grey) or three (RGB)."""
+    """Image in [0, 1], with one (grey) or three channels (RGB)."""
     coverage: Float[Tensor, "views height width"]
-    """1 where the mesh covers the pixel, 0 on the background, between them along anti-aliased
-    outlines. Carries gradients where the backend differentiates visibility."""
+    """1 where the mesh covers the pixel, 0 on the background, in between along anti-aliased
+    outlines. Has gradients if the backend differentiates visibility."""
     face_ids: Int[Tensor, "views height width"] | None = None
     """Index of the visible face, -1 on the background."""
     depth: Float[Tensor, "views height width"] | None = None
@@ -94,18 +94,18 @@ class RenderOutput:
 
 @dataclass(frozen=True)
 class Capabilities:
-    """What a backend can do, so that tests and users know what to expect of it."""
+    """Features of a backend, for tests and users."""
 
     differentiable_shading: bool
     differentiable_visibility: bool
     devices: tuple[str, ...] = ("cpu",)
     decides_ties: bool = True
-    """Whether a pixel centre right on an edge belongs to exactly one of the faces that share it,
-    and of faces in the very same place the first is seen. Ray tracers can't promise it."""
+    """Whether a pixel centre exactly on an edge belongs to exactly one of its faces, and the first
+    of coincident faces is visible. Ray tracers can't guarantee this."""
 
 
 class Renderer(ABC):
-    """A rendering backend. Stateless between calls, apart from caches."""
+    """A rendering backend. Stateless between calls, except for caches."""
 
     capabilities: ClassVar[Capabilities]
 
@@ -121,7 +121,7 @@ class Renderer(ABC):
         """Render one mesh from every camera.
 
         ``resolution`` is (height, width) in pixels. Gradients flow from ``image`` (and, with
-        visibility gradients, ``coverage``) to ``vertices``. An empty mesh gives the background.
+        visibility gradients, ``coverage``) to ``vertices``. An empty mesh renders the background.
         """
 
     def render_lights(
@@ -133,15 +133,15 @@ class Renderer(ABC):
         lights: Float[Tensor, "lights views 3"],
         resolution: tuple[int, int],
     ) -> RenderOutput:
-        """The same picture under several lights: each is seen in a channel of its own.
+        """Render under several lights, one per channel.
 
-        ``lights`` stand where ``shading.light`` does in `render`. This renders once for each; a
-        backend may share what doesn't depend on the light.
+        ``lights`` replace ``shading.light``. The default renders once per light; backends may share
+        light-independent work.
         """
         outs = [
             self.render(vertices, faces, cameras, replace(shading, light=light), resolution)
             for light in lights
         ]
-        # Of a backend with colours, each light takes its own: red, green, blue.
+        # With an RGB backend, each light uses one channel: red, green, blue.
         channels = [out.image[..., min(i, out.image.shape[-1] - 1)] for i, out in enumerate(outs)]
         return replace(outs[0], image=torch.stack(channels, dim=-1))

@@ -1,7 +1,7 @@
-"""Finds an LLVM for Mitsuba's CPU variant, and tries it where a crash does no harm.
+"""Find an LLVM for Mitsuba's CPU variant, and test it in a subprocess.
 
-Mitsuba accepts a wrong LLVM when it starts and then aborts the whole process at the first render.
-So the LLVM is tried in a process of its own first.
+Mitsuba accepts an unsuitable LLVM at start-up, then aborts the whole process at the first render.
+So the LLVM is first tested in a separate process.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from pathlib import Path
 from styleexp.errors import UserError
 
 VARIANT = "llvm_ad_rgb"
-"""The variant of Mitsuba that is used: CPU, differentiable, three colour channels."""
+"""Mitsuba variant: CPU, differentiable, three colour channels."""
 
 PATH = "DRJIT_LIBLLVM_PATH"
-"""The environment variable by which Dr.Jit is told of an LLVM."""
+"""Environment variable with the path of Dr.Jit's LLVM."""
 
 _WHEEL = "karellen-llvm-core"
 _INSTALL = "pip install mitsuba drjit karellen-llvm-core"
-_OLDEST = 19  # that is known to work; 15 and 16 abort, 14 is refused
+_OLDEST = 19  # oldest known to work; 15 and 16 abort, 14 is rejected
 _TIMEOUT = 120.0  # seconds
 
-# Traces one ray to a mesh, which is where a wrong LLVM aborts, and differentiates it.
+# Trace a ray to a mesh, which is where an unsuitable LLVM aborts, and differentiate it.
 _TRIAL = f"""
 import drjit, mitsuba
 mitsuba.set_variant("{VARIANT}")
@@ -44,12 +44,12 @@ assert abs(hit.t[0] - 4) < 1e-4 and drjit.max(drjit.abs(drjit.grad(parameters[ke
 
 @cache
 def prepare() -> None:
-    """Make sure that ``import mitsuba`` followed by ``set_variant(VARIANT)`` will work.
+    """Make sure that ``import mitsuba`` and ``set_variant(VARIANT)`` work.
 
-    Where ``DRJIT_LIBLLVM_PATH`` is not set, sets it for this process and those it starts to the
-    library of the wheel that the extra ``mitsuba`` brings; without the wheel Dr.Jit looks for the
-    system's. A path that is set is kept, whatever it names. Raises ``UserError`` where a package is
-    missing or the trial fails. Takes half a second, once a process.
+    If ``DRJIT_LIBLLVM_PATH`` is not set, sets it, for this process and its children, to the library
+    in the wheel installed by the extra ``mitsuba``; without the wheel, Dr.Jit searches for the
+    system's LLVM. An existing value is kept. Raises ``UserError`` if a package is missing or the
+    trial fails. Takes half a second, once per process.
     """
     for package in ("drjit", "mitsuba"):
         if importlib.util.find_spec(package) is None:
@@ -66,31 +66,31 @@ def prepare() -> None:
         return
     if given:
         raise UserError(
-            f"renderer=mitsuba_ad can't use the LLVM that {PATH} names, '{given}' ({problem}): "
-            f"unset {PATH} to use the one that {_INSTALL} brings on Linux x86-64, or name the "
+            f"renderer=mitsuba_ad can't use the LLVM in {PATH}, '{given}' ({problem}): unset "
+            f"{PATH} to use the one that {_INSTALL} installs on Linux x86-64, or set it to the "
             f"libLLVM.so of LLVM {_OLDEST} or newer."
         )
-    which = f"the LLVM of {_WHEEL}, '{library}'" if library else "an LLVM of the system's"
+    which = f"the LLVM of {_WHEEL}, '{library}'" if library else "the system's LLVM"
     raise UserError(
-        f"renderer=mitsuba_ad can't use {which} ({problem}): {_INSTALL}, which brings a working "
-        f"one on Linux x86-64, or name the libLLVM.so of LLVM {_OLDEST} or newer in {PATH}."
+        f"renderer=mitsuba_ad can't use {which} ({problem}): {_INSTALL}, which installs a working "
+        f"one on Linux x86-64, or set {PATH} to the libLLVM.so of LLVM {_OLDEST} or newer."
     )
 
 
 def from_wheel() -> Path | None:
-    """The ``libLLVM.so`` that ``karellen-llvm-core`` installed, if it is there."""
+    """The ``libLLVM.so`` installed by ``karellen-llvm-core``, if any."""
     try:
         files = importlib.metadata.files(_WHEEL) or []
     except importlib.metadata.PackageNotFoundError:
         return None
     libraries = [Path(str(f.locate())) for f in files if f.name.startswith("libLLVM.so")]
-    # The plain name is a link that the wheel makes when Python first starts: it may be missing.
+    # The plain name is a link that the wheel creates when Python first starts; it may be missing.
     found = sorted(f.resolve() for f in libraries if f.exists())
     return found[0] if found else None
 
 
 def _try() -> str | None:
-    """What is wrong with the LLVM that would be used, or None."""
+    """Test the LLVM that would be used; return the problem, or None."""
     try:
         trial = subprocess.run(
             [sys.executable, "-c", _TRIAL],
@@ -109,4 +109,4 @@ def _try() -> str | None:
     if "LLVM backend is inactive" in trial.stderr:
         return "Dr.Jit can't load it"
     lines = [line.strip() for line in trial.stderr.splitlines() if line.strip()]
-    return lines[-1].rstrip(".") if lines else f"a trial render gave {trial.returncode}"
+    return lines[-1].rstrip(".") if lines else f"a trial render exited with {trial.returncode}"

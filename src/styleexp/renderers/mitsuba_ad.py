@@ -1,20 +1,20 @@
-"""Mitsuba 3 as a backend: ray casting, and projective sampling for the gradients of outlines.
+"""Mitsuba 3 backend: ray casting, with projective sampling for gradients of outlines.
 
-Light. The shared shading is none of Mitsuba's lights: it is clamped after the sum, and its cosine
-goes below zero. So surfaces emit it. Normals are computed in torch, as for all backends; which of
-them a ray sees, and its derivatives, are Mitsuba's and Dr.Jit's part. A picture's first channel is
-the intensity, its second the coverage.
+Light. Mitsuba's lights can't express the shared shading, which clamps after the sum and allows
+negative cosines. So surfaces emit it. Normals are computed in torch, as for all backends;
+intersections and their derivatives come from Mitsuba and Dr.Jit. An image's first channel is the
+intensity, its second the coverage.
 
-Visibility. One scene in the world serves all views: rays go through back faces, which Mitsuba would
-show. The gradient of shading comes from intersections that move with the vertices. The gradient of
-outlines is that of the integrator ``direct_projective``, with no samples of what is seen
-indirectly (``sppi: 0``; guiding those takes seconds and gigabytes). It needs a scene for each view:
-the front faces alone, in a space where Mitsuba's own camera, at the origin, looks along +z with +x
-to the left. Off-centre axes, pixels that are not square and crops are linear maps of that space.
+Visibility. All views share one world-space scene: rays pass through back faces, which Mitsuba would
+show. Shading gradients come from intersections that move with the vertices. Outline gradients come
+from the integrator ``direct_projective``, without samples of indirect visibility (``sppi: 0``;
+guiding those takes seconds and gigabytes). It needs one scene per view: only the front faces, in
+the space of Mitsuba's own camera, which is at the origin and looks along +z with +x to the left.
+Off-centre axes, non-square pixels and crops are linear maps of that space.
 
-Global state, set at first use and not put back: the environment variable ``DRJIT_LIBLLVM_PATH``
-(see ``llvm``), the number of Dr.Jit's threads, which is torch's, and, in every call, Mitsuba's
-variant: ``llvm_ad_rgb``. Code that uses another variant has to set it again after a render.
+Global state, set at first use and not restored: the environment variable ``DRJIT_LIBLLVM_PATH``
+(see ``llvm``), the number of Dr.Jit's threads (torch's), and, in every call, Mitsuba's variant,
+``llvm_ad_rgb``. Code that uses another variant must set it again after a render.
 """
 
 from __future__ import annotations
@@ -38,25 +38,25 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-_LANES = 1 << 22  # rays that are traced together: bounds the memory
+_LANES = 1 << 22  # rays traced per batch: bounds memory
 
 
 class MitsubaAD(Renderer):
-    """Path-space differentiable rendering on the CPU, by Mitsuba's ``direct_projective``.
+    """Path-space differentiable rendering on the CPU, with Mitsuba's ``direct_projective``.
 
-    With ``Shading.outlines`` a pixel is the mean of ``spp`` samples spread over its area, or with
-    one sample its centre's colour. Gradients are sampled too: ``sppc`` times a pixel for shading,
-    and ``sppp`` times the number of pixels along outlines. Everything is drawn from ``seed`` anew
-    in every call and for every view: the same input gives the same picture. Without outlines a
-    pixel is what its centre sees; there is no noise, and gradients are those of shading alone.
+    With ``Shading.outlines`` a pixel is the mean of ``spp`` samples over its area, or with one
+    sample the colour at its centre. Gradients are sampled too: ``sppc`` samples per pixel for
+    shading, and ``sppp`` times the number of pixels along outlines. Sampling restarts from ``seed``
+    for every call and view, so equal inputs give equal images. Without outlines, pixels are
+    evaluated at their centres without noise, and only shading has gradients.
 
-    Grey images (one channel), float32 inside. ``face_ids`` and ``depth`` are what pixel centres
-    see. Raises ``UserError`` where Mitsuba or a working LLVM is missing, for counts or a seed out
-    of range, for vertices that are not on the CPU, and for an unknown ``Shading.normals``.
+    Grey images (one channel), computed in float32. ``face_ids`` and ``depth`` refer to pixel
+    centres. Raises ``UserError`` if Mitsuba or a working LLVM is missing, counts or the seed are
+    out of range, vertices are not on the CPU, or ``Shading.normals`` is unknown.
 
-    As in ``soft_raster``, the gradient leaves out that the borders between the grey levels of flat
-    shaded faces move. Where two faces lie in the same place, either may be seen. Gradients are sums
-    in whatever order the threads come: their last bits vary.
+    As in ``soft_raster``, the gradient ignores that borders between flat-shaded faces move. Of
+    coincident faces, either may be visible. Gradients are summed in arbitrary thread order, so
+    their last bits vary.
     """
 
     capabilities = Capabilities(
@@ -88,8 +88,8 @@ class MitsubaAD(Renderer):
             raise unknown_name("kind of normals", shading.normals, ("flat", "smooth"))
         if vertices.device.type != "cpu":
             raise UserError(
-                f"renderer=mitsuba_ad works on the CPU and the mesh is on '{vertices.device}': "
-                "give device=cpu."
+                "renderer=mitsuba_ad only works on the CPU, but the mesh is on "
+                f"'{vertices.device}': use device=cpu."
             )
         single = vertices.float()
         corners = faces.t().contiguous().long()
@@ -138,20 +138,20 @@ class MitsubaAD(Renderer):
 
 @dataclass(frozen=True)
 class _Job:
-    """What is drawn, but for what carries gradients: the vertices and the normals."""
+    """Inputs of a render except those with gradients: vertices and normals."""
 
     faces: Int[Tensor, "faces 3"]
     front: Bool[Tensor, "views faces"]
-    """Whether the camera is on a face's outer side."""
+    """Whether the camera is on the outer side of a face."""
     eyes: Float[Tensor, "views 3"]
     cameras: Cameras
     light: Float[Tensor, "views 3"]
-    """Direction times strength, in the world."""
+    """Light direction times strength, in world space."""
     shading: Shading
     resolution: tuple[int, int]
 
     def nothing(self, dtype: torch.dtype) -> RenderOutput:
-        """The background."""
+        """Output with only the background."""
         shape = (len(self.eyes), *self.resolution)
         return RenderOutput(
             torch.full((*shape, 1), self.shading.background, dtype=dtype),
@@ -163,7 +163,7 @@ class _Job:
 
 @dataclass(frozen=True)
 class _Rays:
-    """Dr.Jit arrays, one entry a ray; directions reach a depth of 1."""
+    """Rays as Dr.Jit arrays, one entry per ray; directions are scaled to a depth of 1."""
 
     view: Any
     eye: Any
@@ -171,7 +171,7 @@ class _Rays:
 
 
 class _World:
-    """A mesh in Mitsuba and what cameras see of it. The arrays in it are Dr.Jit's."""
+    """A mesh in Mitsuba, and its views. Holds Dr.Jit arrays."""
 
     def __init__(self, job: _Job, vertices: Any, normals: Any, seed: int) -> None:
         """``vertices`` and ``normals`` are flat (x, y, z, x, ...) and may carry gradients."""
@@ -183,7 +183,7 @@ class _World:
         self.rotation = _array(mi.Float, job.cameras.rotation)
         self.focal = _array(mi.Float, job.cameras.focal)
         self.center = _array(mi.Float, job.cameras.center)
-        # Opaque: numbers that change must not be compiled into the kernels.
+        # Opaque, so that changing numbers aren't compiled into the kernels.
         self.near = dr.opaque(mi.Float, job.cameras.near)
         self.albedo = dr.opaque(mi.Float, job.shading.albedo)
         self.ambient = dr.opaque(mi.Float, job.shading.ambient)
@@ -193,8 +193,8 @@ class _World:
             self.scene = mi.load_dict({"type": "scene", "mesh": mesh})
 
     def look(self, samples: int) -> tuple[Any, Any, Any]:
-        """Colours (two a pixel) without gradients, and what pixel centres see: faces, or -1, and
-        depths, or infinity."""
+        """Colours (two channels) without gradients, and the face (or -1) and depth (or infinity) at
+        pixel centres."""
         _, dr = _mitsuba()
         parts = []
         with dr.suspend_grad():
@@ -210,7 +210,7 @@ class _World:
         return color, face, depth
 
     def look_attached(self, samples: int) -> Any:
-        """Colours that carry the gradient of what rays see, not that of what they hit."""
+        """Colours with gradients of shading, but not of visibility."""
         _, dr = _mitsuba()
         parts = []
         for views in self.portions(samples):
@@ -222,14 +222,14 @@ class _World:
         return dr.concat(parts)
 
     def portions(self, samples: int) -> list[range]:
-        """The views, as many at a time as memory should hold."""
+        """Batches of views that bound the memory."""
         height, width = self.job.resolution
         count = len(self.job.eyes)
         together = max(1, _LANES // (height * width * samples))
         return [range(i, min(i + together, count)) for i in range(0, count, together)]
 
     def rays(self, views: range, samples: int) -> _Rays:
-        """Through the centres of the views' pixels, or as many stratified samples of each."""
+        """Rays through pixel centres, or through stratified samples of each pixel."""
         mi, dr = _mitsuba()
         height, width = self.job.resolution
         size = height * width * samples
@@ -245,7 +245,7 @@ class _World:
             sampler.set_samples_per_wavefront(samples)
             sampler.seed(self.seed, size)
             offset = sampler.next_2d()
-            dr.eval(offset)  # the same for every view
+            dr.eval(offset)  # reused for every view
             place += dr.gather(mi.Point2f, dr.ravel(offset), within)
         screen = mi.Point2f(2 * place.x / width - 1, 1 - 2 * place.y / height)
         slope = (screen - self.of(mi.Point2f, self.center, view)) / self.of(
@@ -258,7 +258,7 @@ class _World:
         return _Rays(view, self.of(mi.Point3f, self.eyes, view), direction)
 
     def hit(self, rays: _Rays) -> tuple[Any, Any]:
-        """The first front face beyond the near plane, or -1, and its depth, or infinity."""
+        """First front face beyond the near plane (or -1), and its depth (or infinity)."""
         mi, dr = _mitsuba()
         number = self.job.faces.shape[0]
 
@@ -281,7 +281,7 @@ class _World:
         return face, depth
 
     def color(self, rays: _Rays, face: Any) -> Any:
-        """Intensity and coverage of rays that see these faces."""
+        """Intensity and coverage of rays that hit these faces."""
         mi, dr = _mitsuba()
         seen = face >= 0
         index = mi.UInt32(dr.maximum(face, 0))
@@ -292,19 +292,19 @@ class _World:
             a, b, c = (
                 dr.gather(mi.Point3f, self.vertices, corner, seen) - rays.eye for corner in corners
             )
-            # Barycentric coordinates but for a common factor, which the unit normal is rid of.
+            # Barycentric coordinates up to a common factor, which normalisation removes.
             weights = [dr.dot(rays.direction, dr.cross(p, q)) for p, q in ((c, b), (a, c), (b, a))]
             normal = self.interpolated(corners, weights, seen)
         return self.lit(normal, rays.view, seen)
 
     def interpolated(self, corners: Any, weights: Any, active: Any) -> Any:
-        """The direction of the normal between three vertices."""
+        """Interpolated normal, not normalised."""
         mi, dr = _mitsuba()
         normals = [dr.gather(mi.Vector3f, self.normals, corner, active) for corner in corners]
         return sum(weight * normal for weight, normal in zip(weights, normals, strict=True))
 
     def lit(self, normal: Any, view: Any, seen: Any) -> Any:
-        """The shared shading; ``normal`` may have any length."""
+        """Apply the shared shading; ``normal`` may have any length."""
         mi, dr = _mitsuba()
         squared = dr.squared_norm(normal)
         scale = dr.select(squared > 0, dr.rsqrt(dr.select(squared > 0, squared, 1)), 0)
@@ -313,21 +313,22 @@ class _World:
         return mi.Vector2f(dr.select(seen, intensity, self.background), dr.select(seen, 1.0, 0.0))
 
     def mean(self, color: Any, samples: int) -> Any:
-        """Mean of each pixel's samples, flat."""
+        """Mean over each pixel's samples, as a flat array."""
         _, dr = _mitsuba()
         if samples > 1:
             color = dr.block_reduce(dr.ReduceOp.Add, color, samples) / samples
         return dr.ravel(color)
 
     def of(self, kind: Any, values: Any, view: Any) -> Any:
-        """The views' own values."""
+        """Gather each view's values."""
         _, dr = _mitsuba()
         return dr.gather(kind, values, view)
 
     def outlines(self, view: int, points: Any, samples: int, grad: Any) -> Any:
-        """The gradient, by one view's ``points``, of its colours' ``grad``, through outlines alone.
+        """Gradient w.r.t. one view's ``points``, through outlines only, given its colours'
+        ``grad``.
 
-        ``points`` are the vertices as Mitsuba's camera sees them; all arrays are flat.
+        ``points`` are vertices in the space of Mitsuba's camera; all arrays are flat.
         """
         mi, dr = _mitsuba()
         kept = self.job.front[view].nonzero().view(-1)
@@ -343,21 +344,21 @@ class _World:
             dr.enqueue(dr.ADMode.Backward, image)
             dr.traverse(dr.ADMode.Backward)
         found = dr.grad(points)
-        dr.eval(found)  # before the mesh goes
+        dr.eval(found)  # before the mesh is freed
         return found
 
 
-_BEYOND = 1 + 1e-5  # how far behind a back face a ray goes on, relative to its depth
+_BEYOND = 1 + 1e-5  # depth factor at which a ray continues behind a back face
 
 
 def _array(kind: Any, values: Tensor) -> Any:
-    """A flat Dr.Jit array of a tensor's values."""
+    """Convert a tensor to a flat Dr.Jit array."""
     values = values.float() if values.is_floating_point() else values
     return kind(values.detach().contiguous().view(-1).numpy())
 
 
 def _mesh(vertices: Any, faces: Any) -> Any:
-    """A mesh of flat arrays."""
+    """Make a Mitsuba mesh from flat arrays."""
     mi, dr = _mitsuba()
     mesh = mi.Mesh("mesh", vertex_count=dr.width(vertices) // 3, face_count=dr.width(faces) // 3)
     parameters = mi.traverse(mesh)
@@ -367,13 +368,13 @@ def _mesh(vertices: Any, faces: Any) -> Any:
 
 
 def _divisible(samples: int) -> int:
-    """The next number of samples that the sampler can spread evenly."""
+    """Round up to a number of samples that the sampler can stratify."""
     mi, _ = _mitsuba()
     return mi.load_dict({"type": "multijitter", "sample_count": samples}).sample_count()
 
 
 def _sensor(job: _Job, view: int) -> Any:
-    """Mitsuba's camera, and a film that averages over the area of a pixel."""
+    """Mitsuba camera with a box-filtered film."""
     mi, _ = _mitsuba()
     height, width = job.resolution
     film = {
@@ -399,8 +400,8 @@ def _sensor(job: _Job, view: int) -> Any:
 def _seen_by_mitsuba(
     vertices: Float[Tensor, "vertices 3"], cameras: Cameras, resolution: tuple[int, int]
 ) -> Float[Tensor, "views vertices 3"]:
-    """The vertices where Mitsuba's camera stands at the origin, looks along +z and sees +x to the
-    left, with the x axis of ``focal`` as its field of view; z is the depth."""
+    """Transform vertices to the space of Mitsuba's camera, at the origin, looking along +z with +x
+    to the left, with the field of view of ``focal``'s x axis; z is the depth."""
     height, width = resolution
     rotation, translation = cameras.rotation.to(vertices), cameras.translation.to(vertices)
     focal, center = cameras.focal.to(vertices)[:, :, None], cameras.center.to(vertices)[:, :, None]
@@ -412,13 +413,13 @@ def _seen_by_mitsuba(
 
 
 def _eyes(cameras: Cameras, like: Tensor) -> Float[Tensor, "views 3"]:
-    """Positions of the cameras in the world."""
+    """World positions of the cameras."""
     rotation, translation = cameras.rotation.to(like), cameras.translation.to(like)
     return -(rotation * translation[:, :, None]).sum(1)
 
 
 def _mitsuba() -> tuple[Any, Any]:
-    """The modules ``mitsuba``, in our variant, and ``drjit``."""
+    """Import ``mitsuba``, set to our variant, and ``drjit``."""
     mi, dr = _load()
     if mi.variant() != llvm.VARIANT:
         mi.set_variant(llvm.VARIANT)
@@ -438,10 +439,10 @@ def _load() -> tuple[Any, Any]:
 
 @cache
 def _outlines() -> type:
-    """The class of an operation that gives 0 and has the gradient of outlines.
+    """Class of a custom operation that returns 0 and has the gradient of outlines.
 
-    The scenes of the views are made when the gradient is asked for, one at a time: what Dr.Jit has
-    recorded doesn't keep them alive.
+    The views' scenes are created one at a time in the backward pass, so that Dr.Jit's recorded
+    graph doesn't keep them alive.
     """
     mi, dr = _mitsuba()
     from drjit import CustomOp
@@ -464,7 +465,7 @@ def _outlines() -> type:
 
 
 def _portion(values: Any, index: int, parts: int) -> Any:
-    """One of so many equal parts."""
+    """Part ``index`` of ``parts`` equal parts."""
     mi, dr = _mitsuba()
     size = dr.width(values) // parts
     first = dr.opaque(mi.UInt32, index * size)
@@ -473,13 +474,13 @@ def _portion(values: Any, index: int, parts: int) -> Any:
 
 @cache
 def _integrator() -> type:
-    """The class of our integrator; it can be made only once Mitsuba has a variant."""
+    """Class of our integrator, which can only be defined once Mitsuba's variant is set."""
     mi, dr = _mitsuba()
     from mitsuba.ad import ProjectiveDetail
     from mitsuba.ad.integrators.direct_projective import DirectProjectiveIntegrator
 
     class Silhouette(ProjectiveDetail):
-        """Samples of outlines whose mesh is data, not a number compiled into the kernels."""
+        """Outline samples whose mesh is data, not a constant compiled into the kernels."""
 
         def sample_primarily_visible_silhouette(self, *arguments: Any) -> Any:
             sample = super().sample_primarily_visible_silhouette(*arguments)
@@ -487,10 +488,10 @@ def _integrator() -> type:
             return sample
 
     class Outlines(DirectProjectiveIntegrator):
-        """``direct_projective`` of surfaces that emit the shared shading, outlines only."""
+        """``direct_projective`` for surfaces that emit the shared shading, outlines only."""
 
         def __init__(self, world: _World, mesh: Any, view: int, numbers: Any, samples: int) -> None:
-            """``numbers`` are the indices in the world of the mesh's faces."""
+            """``numbers`` are the world indices of the mesh's faces."""
             super().__init__(mi.Properties())
             self.sppc, self.sppp, self.sppi = 0, samples, 0
             self.proj_detail = Silhouette(self)
@@ -499,9 +500,9 @@ def _integrator() -> type:
             self.scene = mi.load_dict({"type": "scene", "mesh": mesh})
 
         def picture(self, sensor: Any, seed: int) -> Any:
-            """An image that carries the gradient of outlines; None where there are none."""
+            """Image with the gradient of outlines; None if there are none."""
             edges, _ = self.mesh.precompute_silhouette(mi.ScalarPoint3f(0))
-            if not dr.width(edges):  # an error, to the class above
+            if not dr.width(edges):  # the base class treats this as an error
                 return None
             return self.render_ad(self.scene, sensor, seed, 0, dr.ADMode.Backward)
 

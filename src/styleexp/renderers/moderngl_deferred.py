@@ -1,10 +1,10 @@
-"""Visibility from OpenGL, through EGL and so without a display; the rest is ``soft_raster``'s.
+"""Visibility from OpenGL, headless through EGL; the rest is shared with ``soft_raster``.
 
-OpenGL draws an index for each face into an integer image, on a GPU or, with Mesa's llvmpipe, on the
-CPU. Only these indices are read back, 4 bytes a pixel: OpenGL's interpolation is good to 1e-4, so
-depth and barycentric coordinates are computed anew in torch, where gradients need them anyway.
-(moderngl can't share images with CUDA; with a CUDA tensor, vertices go out and indices come in
-through the host, and nothing else does.)
+OpenGL draws face indices into an integer image, on a GPU or, with Mesa's llvmpipe, on the CPU. Only
+these indices are read back, 4 bytes per pixel: OpenGL's interpolation is only accurate to 1e-4, so
+depth and barycentric coordinates are recomputed in torch, where gradients need them anyway.
+(moderngl can't share images with CUDA; for CUDA tensors, only vertices and indices pass through the
+host.)
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ EGL_REMEDY = (
 )
 
 _MARGIN = 1e-3
-"""How much, relative to their depth, the depth buffer reaches beyond the nearest and farthest."""
+"""Relative margin of the depth buffer's range beyond the nearest and farthest vertex."""
 _UNWRITTEN = -2
 
-# Homogeneous pixels become clip coordinates with rows counted downwards, as they lie in memory.
+# Convert homogeneous pixels to clip coordinates, with rows downwards as in memory.
 _VERTEX = """
 #version 330
 uniform vec2 scale;
@@ -65,15 +65,15 @@ void main() { id = -1; }
 
 
 class ModernGLDeferred(DeferredRenderer):
-    """Visibility from OpenGL; all else is ``DeferredRenderer``'s.
+    """Visibility from OpenGL; see ``DeferredRenderer`` for the rest.
 
-    Two faces at the very same depth, to about 1e-7 of the mesh's extent, count as equally near, and
-    the lower index is seen. OpenGL rounds corners to 1/256 of a pixel, so a pixel centre closer to
-    an edge than that may go to either side: 1 pixel in 4000 on a 40k-face mesh.
+    Faces at the same depth, to about 1e-7 of the mesh's extent, are ties, and the lowest index is
+    visible. OpenGL rounds corners to 1/256 of a pixel, so a pixel centre closer to an edge may go
+    to either side: 1 pixel in 4000 on a 40k-face mesh.
 
-    Raises ``UserError`` where moderngl is not installed or EGL offers no OpenGL 3.3. The context is
-    made once for each thread of a process; it can't be taken along into a forked process. After a
-    render no context is current: use your own, if you have one, in ``with context:``.
+    Raises ``UserError`` if moderngl is not installed or EGL has no OpenGL 3.3. One context is
+    created per thread; it can't be used in a forked process. After a render no context is current:
+    use your own in ``with context:``.
     """
 
     def __init__(self, visibility_gradient: str = "contour") -> None:
@@ -82,11 +82,11 @@ class ModernGLDeferred(DeferredRenderer):
 
     @property
     def device_name(self) -> str:
-        """What OpenGL draws with: the name of a GPU, or ``llvmpipe ...`` for the CPU."""
+        """OpenGL device: the name of a GPU, or ``llvmpipe ...`` for the CPU."""
         return str(_canvas().context.info["GL_RENDERER"])
 
     def find_visible(self, projected: Projected) -> Visible:
-        """Draw what may be seen; equal depth goes to the lowest index."""
+        """Draw the candidate faces; ties go to the lowest index."""
         device, pairs = projected.points.device, projected.pairs
         drawn = _canvas().draw(projected).to(device, non_blocking=True)
         flat = drawn.view(-1)
@@ -105,7 +105,7 @@ def _depth_at(
     view: Int[Tensor, " n"],
     face: Int[Tensor, " n"],
 ) -> Float[Tensor, " n"]:
-    """Depth of the faces' planes at the pixels' centres, kept within the range of their corners."""
+    """Depth of the faces' planes at pixel centres, clamped to the range of their corners."""
     height, width = projected.resolution
     count = projected.points.shape[2]
     flat = projected.points.reshape(3, -1)
@@ -121,7 +121,7 @@ def _depth_at(
         right.append(flat[0].index_select(0, index).addcmul_(center_x, w, value=-1))
         down.append(flat[1].index_select(0, index).addcmul_(center_y, w, value=-1))
         depths.append(w)
-    # Barycentric coordinates times a common factor; see ``NormalMatrices``.
+    # Barycentric coordinates up to a common factor; see ``NormalMatrices``.
     weights = [down[j] * right[k] - right[j] * down[k] for j, k in ((1, 2), (2, 0), (0, 1))]
     total = weights[0] + weights[1] + weights[2]
     depth = weights[0] * depths[0]
@@ -134,7 +134,7 @@ def _depth_at(
 
 
 class _Canvas:
-    """An OpenGL context with its programs and buffers, and an image of the last size."""
+    """An OpenGL context with its programs, buffers and image."""
 
     def __init__(self, context: Any) -> None:
         self.context = context
@@ -149,15 +149,16 @@ class _Canvas:
         self._image: Any = None
 
     def draw(self, projected: Projected) -> Int[Tensor, "views height width"]:
-        """Which pair is visible: index into ``projected.pairs``, -1 on the background; int32, on
+        """Visible pair per pixel: index into ``projected.pairs``, -1 on the background; int32, on
         the CPU."""
         points, pairs = projected.points, projected.pairs
         views, count = points.shape[1:]
         height, width = projected.resolution
         if max(height, width) > self.largest:
             raise UserError(
-                f"renderer=moderngl_deferred draws images of up to {self.largest} pixels a side "
-                f"here, not {height} x {width}: choose a lower resolution or renderer=soft_raster."
+                f"renderer=moderngl_deferred can draw images of up to {self.largest} pixels per "
+                f"side here, not {height} x {width}: choose a lower resolution or "
+                "renderer=soft_raster."
             )
         drawn = torch.full(
             (views, height, width), _UNWRITTEN, dtype=torch.int32, pin_memory=points.is_cuda
@@ -188,26 +189,26 @@ class _Canvas:
                 )
         if int(drawn.min()) == _UNWRITTEN:
             raise UserError(
-                "renderer=moderngl_deferred lost its OpenGL context: another library has shut EGL "
-                "down in this process; use that library in a process of its own."
+                "renderer=moderngl_deferred lost its OpenGL context: another library has shut down "
+                "EGL in this process; use that library in a separate process."
             )
         return drawn
 
     def _draw_views(
         self, jobs: list[tuple[int, tuple[float, float]]], first: int, height: int, width: int
     ) -> int:
-        """Draw views, given as (faces, depth range), below one another, beginning with the pair
-        ``first``; returns the pair to go on with."""
+        """Draw views, given as (faces, depth range), one below the other, starting at pair
+        ``first``; return the next pair."""
         gl, image, uniforms = self.context, self._image, self.faces
         image.use()
         image.viewport = (0, 0, width, height * len(jobs))
         image.scissor = None
         image.clear(depth=1.0)
-        # Clearing an integer image with a float colour is undefined: the background is drawn.
+        # Clearing an integer image with a float colour is undefined, so draw the background.
         gl.enable_only(gl.NOTHING)
         self.nothing.render(gl.TRIANGLES, vertices=3)
         gl.enable_only(gl.DEPTH_TEST | gl.CULL_FACE)
-        gl.depth_func = "<"  # of equals, the first drawn stays
+        gl.depth_func = "<"  # ties keep the first face drawn
         gl.front_face = "cw"  # rows go down
         gl.cull_face = "back"
         uniforms["scale"].value = (2 / width, 2 / height)
@@ -223,7 +224,7 @@ class _Canvas:
         return first
 
     def _resize(self, width: int, height: int) -> None:
-        """Make an image of at least this height and just this width, unless it is there."""
+        """Allocate an image of at least this height and exactly this width, unless it exists."""
         if self._image is not None:
             if self._image.width == width and self._image.height >= height:
                 return
@@ -236,8 +237,8 @@ class _Canvas:
 
 
 def _depth_ranges(points: Tensor, near: float) -> list[tuple[float, float]]:
-    """What the depth buffer is to resolve in each view: from the near plane, or the nearest vertex
-    where that is behind it, to the farthest vertex, so that its 24 bits count."""
+    """Depth range of each view: from the near plane, or the nearest vertex behind it, to the
+    farthest vertex, to make the best use of 24 bits."""
     depth = points[2].nan_to_num(nan=near, posinf=near, neginf=near)
     nearest = (depth.amin(1) * (1 - _MARGIN)).clamp_min(near)
     farthest = torch.maximum(depth.amax(1), nearest) * (1 + _MARGIN)
@@ -246,15 +247,15 @@ def _depth_ranges(points: Tensor, near: float) -> list[tuple[float, float]]:
 
 _LOCAL = threading.local()
 _OPENED_BY: set[int] = set()
-"""Processes that opened EGL: this one, and those that it was forked from."""
+"""IDs of processes that opened EGL: this one, and those it was forked from."""
 
 
 def _canvas() -> _Canvas:
-    """This thread's context: OpenGL contexts belong to one thread at a time."""
+    """This thread's context; OpenGL contexts belong to one thread at a time."""
     if _OPENED_BY - {os.getpid()}:
         raise UserError(
-            "renderer=moderngl_deferred can't go on in a process forked from one that has used it: "
-            "start processes with multiprocessing's 'spawn'."
+            "renderer=moderngl_deferred can't be used in a process forked from one that has used "
+            "it: start processes with multiprocessing's 'spawn'."
         )
     canvas = getattr(_LOCAL, "canvas", None)
     if canvas is None:
@@ -278,7 +279,7 @@ def _create_context() -> Callable[..., Any]:
 def _open(create_context: Callable[..., Any]) -> Any:
     try:
         context = create_context(standalone=True, backend="egl", require=330)
-    except Exception as error:  # glcontext raises plain Exceptions
+    except Exception as error:  # glcontext raises plain `Exception`
         reason = " ".join(str(error).split())
         raise UserError(
             f"renderer=moderngl_deferred can't open OpenGL through EGL ({reason}): {EGL_REMEDY}."

@@ -17,7 +17,7 @@ class SoftRasterConfig:
 
     name: str = "soft_raster"
     visibility_gradient: str = "contour"
-    """``contour`` (outlines are anti-aliased and carry gradients) or ``none``."""
+    """``contour`` (anti-aliased outlines with gradients) or ``none``."""
 
 
 @dataclass
@@ -26,7 +26,7 @@ class ModernGLDeferredConfig:
 
     name: str = "moderngl_deferred"
     visibility_gradient: str = "contour"
-    """As for ``soft_raster``."""
+    """``contour`` or ``none``, as for ``soft_raster``."""
 
 
 def _soft_raster(config: SoftRasterConfig) -> Renderer:
@@ -43,17 +43,18 @@ def _moderngl_deferred(config: ModernGLDeferredConfig) -> Renderer:
 
 @dataclass
 class MitsubaADConfig:
-    """Options of ``mitsuba_ad``. Counts are samples per pixel, used where outlines are soft."""
+    """Options of ``mitsuba_ad``. Counts are samples per pixel, for soft outlines."""
 
     name: str = "mitsuba_ad"
     spp: int = 16
-    """Of the picture, rounded up to a number that can be spread evenly; 1 is the pixel's centre."""
+    """Samples per pixel of the image, rounded up to a number that can be stratified; 1: the pixel's
+    centre."""
     sppc: int = 4
-    """Of the gradient of shading, rounded likewise."""
+    """Samples per pixel of the shading gradient, rounded likewise."""
     sppp: int = 1
-    """Of the gradient of outlines; they are spread over the outlines, not over the pixels."""
+    """Samples of the outline gradient per pixel; spread over the outlines, not over the pixels."""
     seed: int = 0
-    """Of all samples; every render starts from it anew."""
+    """Seed of all samples; every render restarts from it."""
 
 
 def _mitsuba_ad(config: MitsubaADConfig) -> Renderer:
@@ -71,7 +72,7 @@ RENDERERS = {
     ),
     "moderngl_deferred": Spec(
         "moderngl_deferred",
-        "faces found by OpenGL through EGL, the rest as soft_raster; needs the extra gl",
+        "visibility by OpenGL through EGL, the rest as in soft_raster; needs the extra gl",
         ModernGLDeferredConfig,
         _moderngl_deferred,
         requires=("moderngl",),
@@ -79,7 +80,7 @@ RENDERERS = {
     ),
     "mitsuba_ad": Spec(
         "mitsuba_ad",
-        "Mitsuba 3, path-space gradients of outlines; CPU, extra 'mitsuba'",
+        "Mitsuba 3, path-space gradients of outlines; CPU, needs the extra mitsuba",
         MitsubaADConfig,
         _mitsuba_ad,
         requires=("mitsuba", "drjit"),

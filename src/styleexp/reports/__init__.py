@@ -1,4 +1,4 @@
-"""From run folders to tables: ``styleexp.reports.collect(folder)``."""
+"""Collect run folders into tables: ``styleexp.reports.collect(folder)``."""
 
 from styleexp.reports.collect import collect
 

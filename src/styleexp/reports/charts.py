@@ -15,7 +15,7 @@ LEFT, RIGHT, TOP, BOTTOM = 58, 12, 12, 34
 
 @dataclass(frozen=True)
 class Scale:
-    """A linear map from values to places."""
+    """A linear map from values to coordinates."""
 
     low: float
     high: float
@@ -23,14 +23,14 @@ class Scale:
     end: float
 
     def __call__(self, value: float) -> float:
-        """The place of a value."""
+        """Coordinate of a value."""
         return self.start + (value - self.low) / (self.high - self.low) * (self.end - self.start)
 
 
 def line_chart(
     title: str, across: str, lines: Sequence[tuple[str, Sequence[float], Sequence[float]]]
 ) -> Markup:
-    """Lines of (label, x, y); values that are not finite interrupt nothing, they are left out."""
+    """Draw lines of (label, x, y); non-finite values are skipped without breaking the line."""
     kept = [
         (label, [(x, y) for x, y in zip(xs, ys, strict=True) if _finite(x) and _finite(y)])
         for label, xs, ys in lines
@@ -54,7 +54,7 @@ def line_chart(
 def dot_chart(
     title: str, across: str, groups: Sequence[tuple[str, Sequence[tuple[str, float]]]]
 ) -> Markup:
-    """A column of dots for each group (label, [(run, value)]) and a line through their means."""
+    """Draw a column of dots per group (label, [(run, value)]), and a line through the means."""
     kept = [(label, [(run, y) for run, y in dots if _finite(y)]) for label, dots in groups]
     values = [y for _, dots in kept for _, y in dots]
     if not values:
@@ -120,7 +120,7 @@ def _scale(values: Sequence[float], start: float, end: float, exact: bool = Fals
 
 
 def _ticks(scale: Scale, count: int) -> list[float]:
-    """Round numbers within the scale, about ``count`` of them."""
+    """About ``count`` round numbers within the scale."""
     rough = (scale.high - scale.low) / count
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(m * power for m in (1, 2, 5, 10) if m * power >= rough * 0.999)

@@ -1,4 +1,4 @@
-"""All runs below a folder as one tidy table."""
+"""Collect all runs below a folder into one tidy table."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ if TYPE_CHECKING:
     import pandas
 
 FIRST = ("run", "status", "seconds", "reason", "device", "loss")
-"""Columns that stand first."""
+"""Leading columns."""
 
 
 def collect(folder: str | Path) -> pandas.DataFrame:
-    """One row for each run below ``folder``, those that failed or never began included.
+    """One row per run below ``folder``, including those that failed or never started.
 
     Columns: ``run`` (its folder, relative), ``status``, ``seconds``, ``reason``, ``device``,
     ``loss`` (mean of the last tenth of the steps), ``config.*``, ``metric.*``, ``version.*``,
-    ``asset.*`` (sha256), ``experiment`` where a plan names it. ``status`` is the run's own; or
-    ``missing``, planned but never begun; ``died``, its process was killed; ``outdated``, its plan
-    was changed since; ``other``, another run lies in the folder of a sweep's or plan's job. Keys of
-    lists are JSON. Raises `UserError` without pandas (extra ``report``) and for no folder.
+    ``asset.*`` (sha256), ``experiment`` if known from a plan. ``status`` is the run's own, or
+    ``missing`` (planned but never started), ``died`` (its process was killed), ``outdated`` (its
+    plan has changed since), or ``other`` (the job's folder contains another run). List values are
+    JSON. Raises `UserError` without pandas (extra ``report``), or if the folder doesn't exist.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -47,9 +47,9 @@ def collect(folder: str | Path) -> pandas.DataFrame:
 
 
 def write(frame: pandas.DataFrame, folder: str | Path) -> list[Path]:
-    """Write ``runs.csv`` and ``runs.parquet``; returns their paths.
+    """Write ``runs.csv`` and ``runs.parquet``; return their paths.
 
-    Parquet columns have one type each: a column of mixed types is written as text.
+    Parquet columns have a single type: columns of mixed types are written as text.
     """
     from styleexp.records import RunFolder
 
@@ -67,7 +67,7 @@ def write(frame: pandas.DataFrame, folder: str | Path) -> list[Path]:
 
 
 def _runs(folder: Path, asked: Iterable[Path]) -> dict[str, dict[str, str]]:
-    """The runs that are, or should be, below a folder, and what is known of them from outside."""
+    """The existing and planned runs below a folder, with what plans and sweeps say about them."""
     from styleexp.sweeps import manifest
 
     found: dict[str, dict[str, str]] = {run: {} for run in _begun(folder)}
@@ -87,7 +87,7 @@ def _runs(folder: Path, asked: Iterable[Path]) -> dict[str, dict[str, str]]:
 
 
 def _begun(folder: Path) -> Iterator[str]:
-    """Folders with a run's record or status; a run has no runs below it."""
+    """Yield folders with a run's record or status; runs aren't nested."""
     for at, below, files in os.walk(folder):
         if "status.json" in files or ("run.json" in files and _is_record(Path(at) / "run.json")):
             below.clear()

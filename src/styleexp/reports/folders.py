@@ -1,4 +1,4 @@
-"""Run folders as they are found on disk, finished or not, whole or damaged."""
+"""Read run folders in any state: finished or not, intact or damaged."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from styleexp.sweeps import jobs
 from styleexp.sweeps.jobs import Job
 
 MARKS = ("run.json", "status.json", ".hydra/overrides.yaml")
-"""Files that tell a run's folder; Hydra's is there before the run has a record."""
+"""Files that mark a run's folder; Hydra's exists before the run has a record."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """One run's files, read once. What is missing is empty, what is damaged is in ``problems``."""
+    """One run's files, read once. Missing files are empty; damaged ones are listed in
+    ``problems``."""
 
     folder: Path
     record: dict[str, Any] = field(default_factory=dict)
@@ -32,25 +33,25 @@ class Run:
     steps: list[dict[str, float]] = field(default_factory=list)
     """``metrics.jsonl``."""
     metrics: dict[str, float] = field(default_factory=dict)
-    """``metrics.json``: what was measured on the result."""
+    """``metrics.json``: the metrics of the result."""
     overrides: list[str] = field(default_factory=list)
     problems: tuple[str, ...] = ()
 
     @property
     def state(self) -> str:
-        """``done``, ``running``, ``interrupted``, ``failed``; ``missing`` if it never began,
-        ``died`` if it calls itself running and no process is at it, ``newer`` if a later version of
-        styleexp wrote it, ``other`` if the folder of a sweep's job holds another run."""
+        """``done``, ``running``, ``interrupted`` or ``failed``; ``missing`` if it never started,
+        ``died`` if its status is running but it has no process, ``newer`` if a later version of
+        styleexp wrote it, ``other`` if a sweep's job folder contains another run."""
         return str(self.status.get("status", "missing"))
 
     @property
     def config(self) -> dict[str, Any]:
-        """The configuration with dotted keys."""
+        """The configuration, flattened to dotted keys."""
         return flatten(self.record.get("config") or {})
 
     @property
     def title(self) -> str:
-        """Source and style in words."""
+        """Source and style as a title."""
         return f"{self.part('source')} in the style of {self.part('style')}"
 
     def part(self, kind: str) -> str:
@@ -61,7 +62,7 @@ class Run:
         return str(chosen.get("name") or self._planned(kind) or f"unknown {kind}")
 
     def _planned(self, kind: str) -> str | None:
-        """The same of a run that never began, as far as its overrides tell."""
+        """Name of the ``source`` or ``style`` of a run that never started, from its overrides."""
         given = dict(each.lstrip("+").split("=", 1) for each in self.overrides if "=" in each)
         if f"{kind}.path" in given:
             return PurePath(given[f"{kind}.path"]).stem
@@ -70,7 +71,7 @@ class Run:
 
     @property
     def command(self) -> str:
-        """What to type to run it again."""
+        """The command that repeats the run."""
         return shlex.join(["styleexp", *self.overrides])
 
     @property
@@ -81,8 +82,8 @@ class Run:
 
     @property
     def summary(self) -> dict[str, float]:
-        """Numbers to compare runs by: the loss's mean over the last tenth of the steps, and
-        whatever was measured on the result."""
+        """Numbers for comparing runs: the mean loss over the last tenth of the steps, and the
+        result's metrics."""
         found: dict[str, float] = {}
         losses = [s["loss"] for s in self.steps if "loss" in s]
         if losses:
@@ -93,7 +94,7 @@ class Run:
 
 
 def read(folder: Path) -> Run:
-    """Read what there is of a run."""
+    """Read a run's folder, as far as possible."""
     problems: list[str] = []
 
     def load(name: str) -> dict[str, Any]:
@@ -103,7 +104,7 @@ def read(folder: Path) -> Run:
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
             if not isinstance(content, dict):
-                raise ValueError("it holds no object")
+                raise ValueError("it is not a JSON object")
         except (OSError, ValueError) as error:
             problems.append(f"{name} cannot be read ({error}).")
             return {}
@@ -132,7 +133,7 @@ def read(folder: Path) -> Run:
 
 
 def readable(folder: Path, purpose: str) -> Run:
-    """The same; a `UserError` for a run that a later version of styleexp wrote."""
+    """Like `read`, but raises `UserError` for a run of a later version of styleexp."""
     run = read(folder)
     if run.state == "newer":
         raise UserError(f"cannot {purpose} '{folder}': {run.status['reason']}")
@@ -140,15 +141,15 @@ def readable(folder: Path, purpose: str) -> Run:
 
 
 def is_run(folder: Path) -> bool:
-    """Whether a run left something here."""
+    """Whether the folder contains files of a run."""
     return any((folder / mark).is_file() for mark in MARKS)
 
 
 def find(folder: Path) -> list[Run]:
-    """Every run at or below ``folder``, in the order of job numbers, then of names.
+    """Every run at or below ``folder``, sorted by job number, then name.
 
-    Jobs that a sweep's ``jobs.json`` or a plan's ``manifest.json`` lists and that never began are
-    there with their overrides and the state ``missing``.
+    Jobs listed in a sweep's ``jobs.json`` or a plan's ``manifest.json`` that never started are
+    included, with their overrides and the state ``missing``.
     """
     found = {path.parents[m.count("/")]: None for m in MARKS for path in folder.rglob(m)}
     asked = {job.folder: job for job in planned(folder)}
@@ -158,7 +159,7 @@ def find(folder: Path) -> list[Run]:
 
 
 def planned(folder: Path) -> Iterator[Job]:
-    """The jobs that sweeps and plans at or below ``folder`` list, without outdated ones."""
+    """The jobs listed by sweeps and plans at or below ``folder``, without outdated ones."""
     for path in folder.rglob(jobs.JOBS):
         if (jobs.listed(path.parent) or {}).get("jobs"):
             yield from jobs.planned(path.parent)
@@ -170,7 +171,8 @@ def planned(folder: Path) -> Iterator[Job]:
 
 
 def _of_job(run: Run, job: Job | None) -> Run:
-    """What a job's folder holds, if it is the job's; else the job with what is there instead."""
+    """The run in a job's folder if it is the job's; else the job, with the mismatch as its
+    state."""
     if job is None or run.state == "newer" or not (run.record or run.state == "done"):
         return run
     state, told = "unreadable", "it has no run.json that can be read"
@@ -186,17 +188,17 @@ def _listed(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))["jobs"]
     except (OSError, ValueError, KeyError, TypeError):
-        return None  # another program's file of that name
+        return None  # a file of another program
 
 
 def natural(path: Path, root: Path) -> list[tuple[int, int, str]]:
-    """Sort key by which job 10 follows job 9."""
+    """Natural sort key: job 10 follows job 9."""
     parts = path.relative_to(root).parts
     return [(0, int(p), "") if p.isdigit() else (1, 0, p) for p in parts]
 
 
 def flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested dictionaries as one, with dotted keys."""
+    """Flatten nested dictionaries to dotted keys."""
     flat: dict[str, Any] = {}
     for key, value in tree.items():
         if isinstance(value, dict):
@@ -223,7 +225,7 @@ def _steps(path: Path, problems: list[str]) -> list[dict[str, float]]:
 
 
 def _composed(folder: Path) -> list[str]:
-    """The overrides that Hydra wrote down for a job that stopped before it had a record."""
+    """The overrides that Hydra recorded for a job that stopped before it had a record."""
     path = folder / ".hydra" / "overrides.yaml"
     if not path.is_file():
         return []
@@ -232,6 +234,6 @@ def _composed(folder: Path) -> list[str]:
 
     try:
         found = OmegaConf.to_container(OmegaConf.load(path))
-    except (OSError, YAMLError):  # Hydra was killed while it wrote
+    except (OSError, YAMLError):  # Hydra was killed while writing
         return []
     return [str(each) for each in found] if isinstance(found, list) else []

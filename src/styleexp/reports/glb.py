@@ -1,9 +1,9 @@
-"""Small GLB files for pages: quantised geometry, a heat map and a wireframe to switch on.
+"""Small GLB files for pages: quantised geometry, with optional heat map and wireframe.
 
-A file holds up to three nodes: the surface in one colour, the same surface coloured by a value of
-its vertices, and its edges. The default scene shows the first; a page shows others by writing other
-nodes into the scene's list (``viewers.js``). Positions and normals are 16-bit integers
-(KHR_mesh_quantization): steps of 1/32767 of the largest coordinate, far below a pixel.
+A file has up to three nodes: the surface in one colour, the surface coloured by a per-vertex value,
+and its edges. The default scene shows the first; a page shows others by changing the scene's list
+of nodes (``viewers.js``). Positions and normals are 16-bit integers (KHR_mesh_quantization), in
+steps of 1/32767 of the largest coordinate, far below a pixel.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 SURFACE, HEAT, EDGES = 0, 1, 2
-"""The nodes, in the file's order."""
+"""Node indices."""
 
 WIREFRAME_FACES = 300_000
-"""Meshes with more faces get no edges: they would fill the surface."""
+"""Meshes with more faces get no wireframe: it would cover the whole surface."""
 
 CLAY = (0.47, 0.45, 0.42)
 """Linear base colour of the surface."""
@@ -34,7 +34,7 @@ INK = (0.02, 0.05, 0.12)
 
 DIVERGING = ((0.09, 0.24, 0.60), (0.42, 0.66, 0.90), (0.93, 0.93, 0.91), (0.93, 0.60, 0.40),
              (0.62, 0.10, 0.12))  # fmt: skip
-"""sRGB, from inward (-1) over none to outward (+1)."""
+"""sRGB colours of the heat map, from inward (-1) through zero to outward (+1)."""
 
 
 def glb(
@@ -44,11 +44,11 @@ def glb(
     values: Float[np.ndarray, " vertices"] | None = None,
     bare: bool = False,
 ) -> bytes:
-    """A binary glTF 2.0 file.
+    """Make a binary glTF 2.0 file.
 
-    ``extent`` bounds every coordinate's magnitude; meshes that are compared share it, so that equal
-    positions stay equal. ``values`` in [-1, 1] choose the colours of the heat map. ``bare`` leaves
-    out all but the surface.
+    ``extent`` bounds the magnitude of every coordinate; compared meshes share it, so that equal
+    positions stay equal. ``values`` in [-1, 1] select the heat map's colours. ``bare`` writes only
+    the surface.
     """
     normals = meshes.vertex_normals(vertices, faces)
     buffer = _Buffer()
@@ -109,7 +109,7 @@ def edges(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "edges 2"]:
 
 
 def diverging(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-    """sRGB in [0, 1] of values in [-1, 1]."""
+    """Map values in [-1, 1] to sRGB in [0, 1]."""
     knots = np.linspace(-1, 1, len(DIVERGING))
     return np.stack([np.interp(values, knots, [c[k] for c in DIVERGING]) for k in range(3)], axis=1)
 
@@ -135,7 +135,7 @@ def _material(colour: tuple[float, float, float]) -> dict[str, Any]:
 
 
 class _Buffer:
-    """The binary chunk, with the views and accessors into it."""
+    """The binary chunk, with its views and accessors."""
 
     def __init__(self) -> None:
         self.parts: list[bytes] = []
@@ -153,7 +153,7 @@ class _Buffer:
         return len(self.views) - 1
 
     def vectors(self, rows: np.ndarray, bounds: bool = False) -> int:
-        """(n, 3) in [-1, 1] as normalised int16, padded to 8 bytes a row as glTF asks."""
+        """Add (n, 3) in [-1, 1] as normalised int16, padded to 8 bytes per row as glTF requires."""
         stored = np.zeros((len(rows), 4), np.int16)
         stored[:, :3] = np.clip(np.rint(rows * 32767), -32767, 32767)
         view = self.view(stored.tobytes(), byteStride=8, target=34962)
@@ -166,7 +166,7 @@ class _Buffer:
         return len(self.accessors) - 1
 
     def coordinates(self, u: np.ndarray) -> int:
-        """u in [0, 1] as the texture coordinates (u, 0.5)."""
+        """Add u in [0, 1] as texture coordinates (u, 0.5)."""
         stored = np.full((len(u), 2), 32768, np.uint16)
         stored[:, 0] = np.rint(np.clip(u, 0, 1) * 65535)
         view = self.view(stored.tobytes(), byteStride=4, target=34962)
@@ -175,7 +175,7 @@ class _Buffer:
         return len(self.accessors) - 1
 
     def indices(self, rows: np.ndarray) -> int:
-        # 65535 restarts a strip in some graphics interfaces and may not be an index.
+        # 65535 is the primitive restart value in some graphics APIs, so it can't be an index.
         kind = np.uint16 if rows.max(initial=0) < 65535 else np.uint32
         view = self.view(np.ascontiguousarray(rows, kind).tobytes(), target=34963)
         component = 5123 if kind is np.uint16 else 5125

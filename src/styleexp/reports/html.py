@@ -1,8 +1,8 @@
-"""Pages of one file that ask the network for nothing.
+"""Self-contained pages without network access.
 
-Scripts, styles, pictures and meshes are inside. A content security policy names the page's one
-script by its hash and allows nothing from elsewhere, so a name from a file can't become code even
-if it were not escaped (it is: the templates escape everything).
+Scripts, styles, pictures and meshes are embedded. A content security policy allows only the page's
+own script, by its hash, so a name from a file can't become code even if it were not escaped (the
+templates escape everything).
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
     from PIL import Image
 
 FORMATS = ("PNG", "GIF")
-"""Of a run's pictures: Pillow must not guess another, and start a program for it."""
+"""Accepted formats of a run's pictures; others could make Pillow start external programs."""
 GZIP_LEVEL = 6
 THUMBNAIL = 200
-"""Pixels on the longer side of a sweep's small pictures."""
+"""Longer side of a sweep's thumbnails in pixels."""
 
 
 def render(template: str, scripts: Sequence[str], **values: Any) -> str:
-    """A page from its template, with the scripts of these names in their order."""
+    """Render a page from its template, with the named scripts in order."""
     import jinja2
 
     environment = jinja2.Environment(
@@ -55,13 +55,13 @@ def render(template: str, scripts: Sequence[str], **values: Any) -> str:
 
 
 def asset(name: str) -> str:
-    """The text of one of our templates, styles or scripts."""
+    """Read a bundled template, style sheet or script."""
     return (resources.files("styleexp.reports") / "assets" / name).read_text(encoding="utf-8")
 
 
 @functools.cache
 def viewer() -> dict[str, str]:
-    """The 3D viewer: ``code``, compressed and in base64, and its ``licences``."""
+    """The 3D viewer: ``code`` (compressed, base64) and ``licences``."""
     vendor = resources.files("styleexp.reports") / "vendor"
     code = (vendor / "model-viewer-umd.min.js.gz").read_bytes()
     return {
@@ -71,12 +71,12 @@ def viewer() -> dict[str, str]:
 
 
 def packed(content: bytes) -> str:
-    """Bytes for a data block: compressed, in base64. The page inflates them."""
+    """Compress and base64-encode bytes for a data block; the page inflates them."""
     return base64.b64encode(gzip.compress(content, GZIP_LEVEL, mtime=0)).decode()
 
 
 def data_uri(picture: Image.Image, longest: int, kind: str = "WEBP") -> str:
-    """A picture, scaled down to ``longest`` pixels on its longer side, as a data URI."""
+    """Encode a picture as a data URI, scaled down to ``longest`` pixels on its longer side."""
     shown = picture.convert("RGB")
     shown.thumbnail((longest, longest))
     out = io.BytesIO()
@@ -85,7 +85,7 @@ def data_uri(picture: Image.Image, longest: int, kind: str = "WEBP") -> str:
 
 
 def picture(path: Path, longest: int) -> str | None:
-    """A picture file as a data URI, an animation's first frame; None if it can't be read."""
+    """Encode a picture file, or an animation's first frame, as a data URI; None if unreadable."""
     from PIL import Image
 
     try:
@@ -98,7 +98,7 @@ def picture(path: Path, longest: int) -> str | None:
 def views(folder: Path, row: int) -> list[Image.Image]:
     """The four views in a row of a run's ``preview.png``: 0 the source, 1 the style, 2 the result.
 
-    Empty where there is no such picture or it is laid out in another way.
+    Empty if there is no such picture or its layout differs.
     """
     from PIL import Image
 
@@ -108,7 +108,7 @@ def views(folder: Path, row: int) -> list[Image.Image]:
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
         return []
     size = sheet.width // 4
-    band = max(18, size // 12)  # as `previews.sheet` does it
+    band = max(18, size // 12)  # as in `previews.sheet`
     if sheet.height != 3 * (size + band):
         return []
     top = row * (size + band) + band
@@ -116,27 +116,27 @@ def views(folder: Path, row: int) -> list[Image.Image]:
 
 
 def save(path: Path, text: str) -> Path:
-    """Write a page whole or not at all."""
+    """Write a page atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     return atomic.write(path, atomic.text(text))
 
 
 def number(value: Any) -> str:
-    """A number for people: four digits; anything else as it stands."""
+    """Format a number with four digits; anything else unchanged."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return plain(value)
     return str(value) if isinstance(value, int) else f"{value:.4g}"
 
 
 def plain(value: Any) -> str:
-    """A configuration's value as one would type it."""
+    """A configuration value as typed on the command line."""
     if value is None or isinstance(value, bool | list | dict):
         return json.dumps(value)
     return str(value)
 
 
 def duration(seconds: float | None) -> str:
-    """Seconds for people."""
+    """Format seconds for people."""
     if seconds is None:
         return "–"
     if seconds < 100:

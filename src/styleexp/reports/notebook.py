@@ -1,6 +1,6 @@
-"""What the notebooks of ``reports/`` share: a table of runs, their figure, the paper's claims.
+"""Shared code of the notebooks in ``reports/``: tables of runs, figures, the paper's claims.
 
-They read collected tables and saved files only; nothing here trains or renders.
+Only reads collected tables and saved files; nothing here trains or renders.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 
 VERDICTS = {True: "yes", False: "no", None: "can't be told"}
 RANDOM = "vgg19_random"
-"""The encoder whose results mean nothing."""
+"""Encoder with random weights, whose results are meaningless."""
 
 
 def runs(folder: str | Path, *experiments: str) -> pandas.DataFrame:
-    """The collected runs of these experiments below ``folder``, in their order; of all, if none.
+    """The collected runs of these experiments (default: all) below ``folder``, in order.
 
-    Besides the columns of `collect` there are ``path``, ``pair`` (source-style), ``seed``, and
-    ``axis.*``, the overrides that not all runs have. Raises `UserError` where there is no such run.
+    Adds to the columns of `collect`: ``path``, ``pair`` (source-style), ``seed``, and ``axis.*``,
+    the overrides that not all runs share. Raises `UserError` if there is no such run.
     """
     folder = Path(folder)
     found = {run.folder: run for run in folders.find(folder)}
@@ -58,18 +58,18 @@ def runs(folder: str | Path, *experiments: str) -> pandas.DataFrame:
 
 
 def belongs(run: folders.Run, experiments: Sequence[str]) -> bool:
-    """Whether a run is of one of the experiments: it was started so, or lies in its folder."""
+    """Whether a run belongs to one of the experiments, by its overrides or its folder."""
     named = sweep_page.settings(run).get("experiment")
     return named in experiments or any(part in experiments for part in run.folder.parts)
 
 
 def caution(frame: pandas.DataFrame) -> str:
-    """What a reader has to know of these runs before believing them, as Markdown; may be empty."""
+    """Caveats about these runs, as Markdown; may be empty."""
     told = []
     not_done = frame[frame["status"] != "done"]
     if len(not_done):
         counts = ", ".join(f"{n} {state}" for state, n in not_done["status"].value_counts().items())
-        told.append(f"{len(not_done)} of {len(frame)} runs are not there: {counts}.")
+        told.append(f"{len(not_done)} of {len(frame)} runs are not finished: {counts}.")
     learned = frame
     if "config.baseline.name" in frame:
         learned = frame[frame["config.baseline.name"].isna()]
@@ -80,14 +80,14 @@ def caution(frame: pandas.DataFrame) -> str:
     if steps is not None and steps.dropna().max() < 100:
         told.append(f"The runs have {steps.dropna().max():g} steps, the paper's 1000.")
     if "seed" in frame and frame["seed"].nunique() == 1:
-        told.append("There is one seed: differences may be chance.")
+        told.append("There is only one seed: differences may be due to chance.")
     return "\n".join(f"- **{each}**" for each in told)
 
 
 def pictures(frame: pandas.DataFrame, columns: str, rows: str = "pair") -> Shown:
-    """The results, laid out by two columns of the table: the paper's figure from saved files.
+    """Arrange the results by two columns of the table, as in the paper's figure, from saved files.
 
-    Each row begins with its source. What did not finish is a cell that says so.
+    Each row starts with its source. Cells of unfinished runs show their status.
     """
     from matplotlib.figure import Figure
 
@@ -116,7 +116,7 @@ def pictures(frame: pandas.DataFrame, columns: str, rows: str = "pair") -> Shown
 
 
 def _show_row_head(axis: Any, line: pandas.DataFrame, label: str) -> None:
-    """The row's label, and out of a preview its source, and its style if it has but one."""
+    """Show the row's label, its source from a preview, and its style if it has only one."""
     rows = (0, 1) if line["pair"].nunique() == 1 else (0,)
     axis.set_title(f"{label}\n({'source, style' if len(rows) == 2 else 'source'})", fontsize=9)
     for path in line["path"]:
@@ -128,8 +128,8 @@ def _show_row_head(axis: Any, line: pandas.DataFrame, label: str) -> None:
 
 
 def triples(frame: pandas.DataFrame, across: int = 2) -> Shown:
-    """Source, style and result of every run, ``across`` runs side by side. What did not finish is
-    a cell that says so."""
+    """Show source, style and result of every run, ``across`` runs per row. Cells of unfinished runs
+    show their status."""
     from matplotlib.figure import Figure
 
     down = math.ceil(len(frame) / across)
@@ -149,7 +149,7 @@ def triples(frame: pandas.DataFrame, across: int = 2) -> Shown:
 
 
 def bars(frame: pandas.DataFrame, by: str, metrics: Sequence[str]) -> Shown:
-    """A small chart for each metric: a dot for each run, a line for the mean."""
+    """Draw a small chart per metric: a dot per run, a line for the mean."""
     from matplotlib.figure import Figure
 
     kept = [m for m in metrics if f"metric.{m}" in frame or m in frame]
@@ -171,7 +171,7 @@ def bars(frame: pandas.DataFrame, by: str, metrics: Sequence[str]) -> Shown:
 
 
 def _picture(figure: Figure) -> Shown:
-    """A figure to show in a notebook, whatever its backend."""
+    """Convert a figure for display in a notebook, with any backend."""
     import io
 
     from IPython.display import Image
@@ -182,9 +182,9 @@ def _picture(figure: Figure) -> Shown:
 
 
 def mean(frame: pandas.DataFrame, metric: str, **where: Any) -> float:
-    """Mean of a metric over the finished runs that match; NaN where none was measured.
+    """Mean of a metric over the matching finished runs; NaN if none was measured.
 
-    ``where`` names columns, with ``__`` for a dot: ``axis__layers="low"``.
+    ``where`` filters by column, with ``__`` for a dot: ``axis__layers="low"``.
     """
     column = f"metric.{metric}" if f"metric.{metric}" in frame else metric
     if column not in frame:
@@ -199,8 +199,8 @@ def mean(frame: pandas.DataFrame, metric: str, **where: Any) -> float:
 
 
 def slope(path: str | Path) -> float:
-    """Root mean square change of the displacement along the result's edges, by their length: how
-    steep, and with the height how fine, the relief is. NaN without a result."""
+    """RMS slope of the displacement along the result's edges: how steep and, relative to the
+    height, how fine the relief is. NaN without a result."""
     from styleexp.reports.glb import edges
 
     file = Path(path) / "result.ply"
@@ -217,16 +217,17 @@ def slope(path: str | Path) -> float:
 
 @dataclass(frozen=True)
 class Claim:
-    """Something that the paper says, beside what the runs show."""
+    """A claim of the paper, with the corresponding result of the runs."""
 
     paper: str
     ours: str
     holds: bool | None
-    """None where it can't be told."""
+    """None if undecidable."""
 
 
 def smaller(paper: str, first: tuple[str, float], second: tuple[str, float], what: str) -> Claim:
-    """The claim that the first number is smaller than the second; can't be told without both."""
+    """The claim that the first number is smaller than the second; undecidable unless both are
+    known."""
     ours = f"{what}: {first[0]} {first[1]:.3g}, {second[0]} {second[1]:.3g}"
     if math.isnan(first[1]) or math.isnan(second[1]):
         return Claim(paper, f"{ours} (nan: not measured)", None)
@@ -234,19 +235,19 @@ def smaller(paper: str, first: tuple[str, float], second: tuple[str, float], wha
 
 
 def claims(*each: Claim) -> HTML:
-    """The claims as a table to show."""
+    """Display claims as a table."""
     import pandas
     from IPython.display import HTML
 
     rows = [(c.paper, c.ours, VERDICTS[c.holds]) for c in each]
     frame = pandas.DataFrame(rows, columns=["the paper says", "we see", "does it hold"])
-    with pandas.option_context("display.max_colwidth", None):  # else pandas cuts sentences off
+    with pandas.option_context("display.max_colwidth", None):  # else pandas truncates sentences
         return HTML(frame.to_html(index=False, border=0))
 
 
 def table(frame: pandas.DataFrame, metrics: Sequence[str] = ()) -> pandas.DataFrame:
-    """The runs' axes and numbers, for people: those of ``metrics`` that are there, or all."""
-    # What ``pair`` tells; and which experiment a run shared by several was started for.
+    """The runs' axes and numbers for display: those of ``metrics`` that exist, or all."""
+    # Redundant with ``pair``; and the experiment that started a run shared by several.
     told = ("axis.pair", "axis.source", "axis.style", "axis.experiment")
     axes = [c for c in frame if str(c).startswith("axis.") and c not in told]
     measured = [f"metric.{m}" for m in metrics] or [c for c in frame if c.startswith("metric.")]
@@ -256,7 +257,8 @@ def table(frame: pandas.DataFrame, metrics: Sequence[str] = ()) -> pandas.DataFr
 
 
 def show(frame: pandas.DataFrame) -> HTML:
-    """A table for a page: four digits, dashes for what was not measured, the columns' meanings."""
+    """Format a table for a page: four digits, dashes for missing values, meanings of the
+    columns."""
     from IPython.display import HTML
 
     def cell(value: float) -> str:
@@ -273,7 +275,7 @@ OWN_LOSS = "of the run's last steps; other layers or weights have another scale"
 
 
 def save(frame: pandas.DataFrame, folder: str | Path | None, name: str) -> None:
-    """Write a table as ``name.csv`` and ``name.tex`` (booktabs), if there is a folder for it."""
+    """Write a table as ``name.csv`` and ``name.tex`` (booktabs), if a folder is given."""
     if folder is None:
         return
     from styleexp.records import RunFolder
@@ -285,7 +287,7 @@ def save(frame: pandas.DataFrame, folder: str | Path | None, name: str) -> None:
 
 
 def latex(frame: pandas.DataFrame) -> str:
-    """A table for a paper that loads booktabs; text is escaped, numbers have four digits."""
+    """A LaTeX table with booktabs; text is escaped, numbers have four digits."""
 
     def cell(value: Any) -> str:
         if isinstance(value, float | np.floating):

@@ -24,15 +24,15 @@ NOTEBOOKS: dict[str, tuple[str, ...]] = {
     "board": ("board",),
     "appendix": (),
 }
-"""The experiments of each notebook; it is left out where none of them ran. None: it takes all."""
+"""Experiments of each notebook, which is skipped if none of them ran. Empty: uses all runs."""
 
 
 def execute(folder: Path, names: Sequence[str] = ()) -> tuple[list[Path], list[str]]:
     """Execute the notebooks that have runs below ``folder``, or those named, into
     ``folder/notebooks``.
 
-    Returns the HTML files and, for each notebook that was left out, why. Raises `UserError` for an
-    unknown name, a notebook that fails, missing packages, and where there is no run at all.
+    Returns the HTML files, and the reason for each skipped notebook. Raises `UserError` for an
+    unknown name, a failing notebook, missing packages, or if there is no run.
     """
     try:
         import jupytext
@@ -78,7 +78,7 @@ def execute(folder: Path, names: Sequence[str] = ()) -> tuple[list[Path], list[s
                         progress_bar=False,
                         log_output=False,
                         config=_kernel(),
-                        extra_arguments=["--log-level=CRITICAL"],  # ours is the only output
+                        extra_arguments=["--log-level=CRITICAL"],  # hide the converter's output
                     )
             except papermill.PapermillExecutionError as error:
                 raise UserError(
@@ -90,7 +90,7 @@ def execute(folder: Path, names: Sequence[str] = ()) -> tuple[list[Path], list[s
 
 
 def _kernel() -> Any:
-    """Where there are sockets of files, talk to the kernel through them, not through open ports."""
+    """Kernel manager that uses Unix sockets, where available, instead of open ports."""
     from traitlets.config import Config
 
     transport = "ipc" if os.name == "posix" else "tcp"
@@ -98,8 +98,8 @@ def _kernel() -> Any:
 
 
 def as_page(notebook: Path) -> str:
-    """What an executed notebook says and shows, without its code, as a page of ours: one file, no
-    script from anywhere."""
+    """Render an executed notebook without its code as a self-contained page, without external
+    scripts."""
     import nbformat
     from markupsafe import Markup
     from nbconvert import HTMLExporter

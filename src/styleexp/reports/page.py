@@ -1,4 +1,4 @@
-"""The page of one run, ``report.html``: one file, without a network."""
+"""The page of one run, ``report.html``: self-contained, without network access."""
 
 from __future__ import annotations
 
@@ -20,50 +20,50 @@ if TYPE_CHECKING:
 
 NAME = "report.html"
 STYLE_PIXELS = 720
-"""A style picture's longer side on the page."""
+"""Longer side of a style picture on the page, in pixels."""
 STILL_PIXELS = 1280
 MEANINGS = {
-    "style_distance": "to the style, by an encoder that was not trained with; 0 the style, 1 none",
+    "style_distance": "to the style, by an encoder not used in training; 0: the style, 1: no style",
     "relief_distance": "to the style's relief or a picture's brightness, no network; 0 is equal",
-    "relief_rms": "root mean square height of the relief, in radii of the source",
-    "relief_share": "that height over the style mesh's own",
-    "silhouette_iou": "overlap of the silhouettes with the source's; 1 is equal",
-    "chamfer": "mean distance to the source's surface, over its diagonal",
-    "hausdorff": "largest distance to the source's surface, over its diagonal",
-    "volume_change": "of the source's volume",
-    "flipped_faces": "share of the faces that point the other way now",
-    "self_intersections": "share of the faces that cut another one",
-    "spike": "farthest displacements over the root mean square; large where few stick out",
+    "relief_rms": "RMS height of the relief, in radii of the source",
+    "relief_share": "RMS height relative to the style mesh's",
+    "silhouette_iou": "IoU of the silhouettes with the source's; 1 is equal",
+    "chamfer": "mean distance to the source's surface, relative to its diagonal",
+    "hausdorff": "maximum distance to the source's surface, relative to its diagonal",
+    "volume_change": "relative to the source's volume",
+    "flipped_faces": "fraction of faces that are flipped",
+    "self_intersections": "fraction of faces that intersect another one",
+    "spike": "largest displacements relative to the RMS; large if few vertices stand out",
 }
-"""What the metrics of `styleexp.metrics` mean, in short."""
+"""Short descriptions of the metrics in `styleexp.metrics`."""
 FILES = (
     ("result.glb", "the result, for viewers and engines"),
     ("result.ply", "with the displacement as a vertex attribute"),
-    ("result.obj", "in the input's own rows"),
+    ("result.obj", "with the input file's own vertices"),
     ("preview.png", "four views of source, style and result"),
-    ("turntable.gif", "the result turning"),
-    ("run.json", "everything that went in"),
-    ("metrics.jsonl", "a line a step"),
-    ("metrics.json", "what was measured on the result"),
-    ("check.png", "the result as pyrender draws it"),
+    ("turntable.gif", "a turntable of the result"),
+    ("run.json", "all inputs of the run"),
+    ("metrics.jsonl", "one line per step"),
+    ("metrics.json", "metrics of the result"),
+    ("check.png", "the result drawn by pyrender"),
 )
 
 
 def write(run: Run, shown: Shown) -> Path:
-    """Write a run's page into its folder; returns its path."""
+    """Write a run's page into its folder; return its path."""
     return html.save(run.folder / NAME, build(run, shown))
 
 
 def write_ended(folder: Path, result: Result, seconds: float) -> Path:
-    """The page of a run whose last step is done and whose status is about to say so."""
+    """Write the page of a run that has finished its last step but not yet updated its status."""
     run = folders.read(folder)
     status = {"status": "done", "seconds": round(seconds, 1)}
     return write(dataclasses.replace(run, status=status), shows.of(result))
 
 
 def rewrite(folder: Path, tell: Callable[[str], Any] | None = None) -> Path:
-    """The page of a run, finished or not, from what its folder holds; ``tell`` takes a sentence for
-    each thing that could not be shown."""
+    """Write the page of a run, finished or not, from its folder; ``tell`` is called with a sentence
+    for everything that couldn't be shown."""
     run = folders.readable(folder, "show")
     shown = shows.read(run)
     if tell is not None:
@@ -73,7 +73,7 @@ def rewrite(folder: Path, tell: Callable[[str], Any] | None = None) -> Path:
 
 
 def build(run: Run, shown: Shown) -> str:
-    """The page's text."""
+    """Render the page as HTML."""
     style_picture = None
     if isinstance(shown.style, np.ndarray):
         from PIL import Image
@@ -102,7 +102,7 @@ def build(run: Run, shown: Shown) -> str:
 
 
 def facts(run: Run, shown: Shown) -> list[tuple[str, str]]:
-    """The few numbers that a reader wants first."""
+    """The key numbers of a run."""
     found = [("status", run.state)]
     if asked := [each for each in run.overrides if not each.lstrip("+~").startswith("hydra.")]:
         found.append(("asked for", " ".join(asked)))
@@ -129,7 +129,7 @@ def facts(run: Run, shown: Shown) -> list[tuple[str, str]]:
 
 
 def panels(run: Run, shown: Shown) -> list[dict[str, str]]:
-    """The meshes side by side: key, title, and what a reader who can't see them should know."""
+    """The meshes, side by side: key, title, and alternative text."""
     made = []
     source, style = run.part("source"), run.part("style")
     for key, title, alt in (
@@ -143,7 +143,7 @@ def panels(run: Run, shown: Shown) -> list[dict[str, str]]:
 
 
 def curves(run: Run) -> list[Any]:
-    """Charts of what was measured in each step."""
+    """Charts of the per-step measurements."""
     at = [step["step"] for step in run.steps]
 
     def line(key: str, label: str) -> tuple[str, list[float], list[float]]:
@@ -179,7 +179,7 @@ def _heat(shown: Shown) -> dict[str, str] | None:
 
 
 def _assets(run: Run) -> list[dict[str, str]]:
-    """Where source and style came from, with licence and author where they are known."""
+    """Origin of source and style, with licence and author if known."""
     from styleexp import assets
 
     rows = []
@@ -190,7 +190,7 @@ def _assets(run: Run) -> list[dict[str, str]]:
         elif known is not None and row["sha256"].startswith(known.sha256):
             origin = f"{known.author}; {known.source}; {known.licence}"
         else:
-            origin = "a file of yours"
+            origin = "your file"
         rows.append(
             {
                 "kind": kind,

@@ -1,4 +1,4 @@
-"""How far raters agree, and how sure a mean is."""
+"""Inter-rater agreement, and confidence intervals."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ Level = Literal["nominal", "ordinal", "interval"]
 
 
 def krippendorff_alpha(ratings: Float[np.ndarray, "raters units"], level: Level) -> float:
-    """Krippendorff's alpha: 1 where all agree, 0 where they agree as if by chance.
+    """Krippendorff's alpha: 1 for full agreement, 0 for agreement by chance.
 
-    NaN marks what a rater did not rate; a unit with fewer than two ratings tells nothing. NaN comes
-    back where alpha is undefined: no two ratings of one unit, or one value only.
+    NaN marks missing ratings; units with fewer than two ratings are ignored. Returns NaN if alpha
+    is undefined: no unit with two ratings, or only one value.
 
     From coincidences, K. Krippendorff, "Computing Krippendorff's Alpha-Reliability" (2011).
     """
@@ -49,12 +49,15 @@ def _distances(values: np.ndarray, totals: np.ndarray, level: Level) -> np.ndarr
         return 1.0 - np.eye(len(values))
     if level == "interval":
         return np.subtract.outer(values, values) ** 2
-    ranks = np.cumsum(totals) - totals / 2  # the number of values between two, ends counted half
+    ranks = (
+        np.cumsum(totals) - totals / 2
+    )  # number of values between two, with the ends counted half
     return np.subtract.outer(ranks, ranks) ** 2
 
 
 def mean_interval(values: Float[np.ndarray, " n"]) -> tuple[float, float, float]:
-    """Mean and the ends of its 95 % confidence interval by Student's t; NaN ends for one value."""
+    """Mean and bounds of its 95 % confidence interval (Student's t); NaN bounds for a single
+    value."""
     from scipy import stats
 
     mean = float(np.mean(values))

@@ -1,4 +1,4 @@
-"""One run's folder as a flat row. Needs nothing but the standard library."""
+"""One run's folder as a flat row. Needs only the standard library."""
 
 from __future__ import annotations
 
@@ -14,17 +14,16 @@ if TYPE_CHECKING:
     from styleexp.sweeps.jobs import Job
 
 FINAL_SHARE = 10
-"""The final loss is the mean over the last tenth of the steps."""
+"""Inverse fraction of the steps that the final loss averages: the last tenth."""
 
 
 def read(folder: Path) -> dict[str, Any]:
-    """What is known of a run: ``status``, ``seconds``, ``reason``, ``loss``, ``metric.*``,
-    ``config.*``, ``version.*``, ``device``, ``asset.*`` (sha256, or the name of what has no file).
+    """A run as a flat row: ``status``, ``seconds``, ``reason``, ``loss``, ``metric.*``,
+    ``config.*``, ``version.*``, ``device``, ``asset.*`` (sha256, or the name if there is no file).
 
-    ``status`` is the run's own (see ``RunFolder.write_status``), ``missing`` where there is none,
-    ``died`` where a run calls itself running but no process is at it, ``newer`` where a later
-    version of styleexp wrote it. Nothing raises: what can't be
-    read is left out, and ``reason`` says so.
+    ``status`` is the run's own (see ``RunFolder.write_status``), ``missing`` if there is none,
+    ``died`` if it says running but there is no process, ``newer`` if a later version of styleexp
+    wrote it. Never raises: unreadable files are skipped, and ``reason`` says so.
     """
     faults: list[str] = []
     told = _json(folder / "status.json", faults)
@@ -50,10 +49,10 @@ def read(folder: Path) -> dict[str, Any]:
 
 
 def of_job(job: Job) -> dict[str, Any]:
-    """The same of a job's folder, if what lies there is the job's.
+    """The row of a job's run, if its folder contains it.
 
-    ``status`` is ``other`` where the folder holds another run, whose numbers aren't told, and
-    ``unreadable`` where a run that ended has no record that tells which it was.
+    ``status`` is ``other`` if the folder contains another run, whose numbers are omitted, and
+    ``unreadable`` if an ended run has no record that identifies it.
     """
     record = _json(job.folder / "run.json", [])
     row = read(job.folder)
@@ -70,12 +69,12 @@ def of_job(job: Job) -> dict[str, Any]:
 
 
 def status(folder: Path) -> str | None:
-    """A run's status as it wrote it; None where it wrote none that can be read."""
+    """A run's status as written; None if missing or unreadable."""
     return _json(folder / "status.json", []).get("status")
 
 
 def steps(folder: Path) -> int:
-    """How many steps a run has noted."""
+    """Number of steps in a run's metrics."""
     try:
         return (folder / "metrics.jsonl").read_bytes().count(b"\n")
     except OSError:
@@ -97,7 +96,7 @@ def _json(path: Path, faults: list[str]) -> dict[str, Any]:
 
 
 def _flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted keys; lists as JSON, so that a column has one type."""
+    """Yield dotted keys and values; lists as JSON, so that each column has one type."""
     for key, value in tree.items():
         if isinstance(value, Mapping):
             yield from _flat(value, f"{prefix}{key}.")
@@ -110,7 +109,7 @@ def _plain(value: Any) -> bool:
 
 
 def _final_loss(path: Path) -> float | None:
-    """Mean loss of the last tenth of the steps; lines cut off by a kill don't count."""
+    """Mean loss of the last tenth of the steps, without truncated lines."""
     losses = []
     try:
         lines = path.read_text(encoding="utf-8").splitlines()

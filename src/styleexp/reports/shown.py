@@ -1,4 +1,4 @@
-"""What a page shows in 3D: source, style and result, from a live run or from its folder."""
+"""3D content of a page: source, style and result, from a live run or its folder."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from styleexp.stylize import Result
 
 WITHIN = 99.5
-"""Percent of the vertices whose displacement the heat map's colours tell apart; a few spikes would
-otherwise leave no colour for the rest."""
+"""Percentile of |displacement| at which the heat map saturates, so that a few spikes don't use up
+the colour range."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A mesh to show, in the unit sphere of whatever it is compared with."""
+    """A mesh to show, normalised like the mesh it is compared with."""
 
     vertices: Float[np.ndarray, "vertices 3"]
     faces: Int[np.ndarray, "faces 3"]
@@ -34,31 +34,31 @@ class Shape:
 
 @dataclass(frozen=True)
 class Shown:
-    """All three, as far as they are there."""
+    """Source, style and result, as far as available."""
 
     source: Shape | None = None
     style: Shape | np.ndarray | None = None
     """A mesh, or a picture of shape (height, width, 3) in [0, 1]."""
     result: Shape | None = None
     displacement: Float[np.ndarray, " vertices"] | None = None
-    """Of the result's vertices, in the source's own units."""
+    """Displacement of the result's vertices, in the source's own units."""
     radius: float = 1.0
-    """Of the source's bounding sphere, in its own units."""
+    """Radius of the source's bounding sphere, in its own units."""
     missing: tuple[str, ...] = ()
-    """A sentence for each that is not there."""
+    """One sentence for each that is unavailable."""
 
     @property
     def reach(self) -> float:
-        """The displacement at which the heat map's colours end."""
+        """Displacement at which the heat map saturates."""
         if self.displacement is None or not len(self.displacement):
             return 0.0
         return float(np.percentile(np.abs(self.displacement), WITHIN))
 
     def files(self, bare: bool = False) -> dict[str, bytes]:
-        """A GLB for each mesh; source and result share their frame. See `glb.glb` for ``bare``."""
+        """One GLB per mesh; source and result share a frame. See `glb.glb` for ``bare``."""
         pair = [shape for shape in (self.source, self.result) if shape is not None]
         reach = max((float(np.abs(shape.vertices).max()) for shape in pair), default=1.0)
-        extent = math.ceil(1e4 * reach) / 1e4  # the same from a file in single precision
+        extent = math.ceil(1e4 * reach) / 1e4  # equal for a result read in single precision
         values = None
         if self.displacement is not None:
             values = np.clip(self.displacement / (self.reach or 1.0), -1, 1)
@@ -74,7 +74,7 @@ class Shown:
 
 
 def of(result: Result) -> Shown:
-    """What a run that has just ended shows."""
+    """Content of a run that has just ended."""
     scene = result.scene
     return Shown(
         source=Shape(scene.frame.apply(scene.source.vertices), scene.source.faces),
@@ -86,8 +86,8 @@ def of(result: Result) -> Shown:
 
 
 def read(run: Run) -> Shown:
-    """What a run's folder shows. Source and style come from the files that they came from, if those
-    are still the same; which are not is in ``missing``."""
+    """Content of a run's folder. Source and style are read from their original files, if unchanged;
+    others are listed in ``missing``."""
     missing: list[str] = []
     source, style = _load(run, missing)
     found: dict[str, Any] = {}
@@ -102,7 +102,7 @@ def read(run: Run) -> Shown:
         try:
             vertices, faces, displacement = read_result(path)
             frame = frame or meshes.normalisation(vertices)
-        except Exception as error:  # whatever a damaged file does
+        except Exception as error:  # whatever a damaged file raises
             missing.append(f"The result can't be shown: result.ply cannot be read ({error}).")
         else:
             found |= {"result": Shape(frame.apply(vertices), faces), "displacement": displacement}
@@ -112,16 +112,16 @@ def read(run: Run) -> Shown:
 
 
 def read_result(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Vertices (n, 3), faces (m, 3) and displacement (n,) of a ``result.ply``, rows as stored."""
+    """Vertices (n, 3), faces (m, 3) and displacement (n,) of a ``result.ply``, in file order."""
     from styleexp.meshes.ply import stored_result
 
     return stored_result(path.read_bytes())
 
 
 def read_moved(folder: Path) -> tuple[meshes.Mesh, np.ndarray, np.ndarray]:
-    """A finished run's source, its moved vertices (vertices, 3), their displacement (vertices,).
+    """A finished run's source, moved vertices (vertices, 3), and displacement (vertices,).
 
-    Raises `UserError` where they can't be had.
+    Raises `UserError` if they are unavailable.
     """
     from styleexp.meshes.writing import ply_rows
     from styleexp.reports import folders
@@ -135,13 +135,13 @@ def read_moved(folder: Path) -> tuple[meshes.Mesh, np.ndarray, np.ndarray]:
         raise UserError(f"'{folder}' can't be used: {missing[0]}")
     try:
         stored, faces, values = read_result(path)
-    except Exception as error:  # whatever a damaged file does
+    except Exception as error:  # whatever a damaged file raises
         raise UserError(f"'{path}' cannot be read ({error}): run again.") from None
     rows, corners = np.arange(len(source.vertices)), source.faces
     if source.carrier is not None:
         first, combined = ply_rows(source.carrier)
         rows, corners = source.carrier.rows[first], combined[source.carrier.corners]
-    # As many vertices in another order, as another version wrote them, would be another mesh.
+    # The same number of vertices in another order, as written by another version, is another mesh.
     if values is None or len(stored) != len(rows) or not np.array_equal(faces, corners):
         raise UserError(
             f"'{path}' has other vertices than its source '{source.name}' (as baseline="
@@ -154,7 +154,7 @@ def read_moved(folder: Path) -> tuple[meshes.Mesh, np.ndarray, np.ndarray]:
 
 
 def _load(run: Run, missing: list[str]) -> tuple[meshes.Mesh | None, Any]:
-    """Source and style of a run's record, None where they can't be had as they were."""
+    """Source and style of a run's record; None if they are missing or have changed."""
     from styleexp import compose, origins, sources
 
     if not run.record.get("config"):

@@ -1,7 +1,7 @@
-"""The user study's page (Sec. 4.4): every pair is shown turning and rated from 1 to 5.
+"""The user study's page (Sec. 4.4): every pair is shown on a turntable and rated from 1 to 5.
 
-It is one file without a server: answers stay in the participant's browser until they are saved as a
-file of theirs, which `styleexp.reports.study_results` reads.
+It is a single file without a server: answers stay in the participant's browser until saved to a
+file, which `styleexp.reports.study_results` reads.
 """
 
 from __future__ import annotations
@@ -21,17 +21,16 @@ from styleexp.reports.page import STYLE_PIXELS
 NAME = "study.html"
 SCHEMA = "styleexp-study-1"
 QUESTION = "How well does the result match the target style?"
-"""After the paper: "rate how well the style transfer results matched the target style"."""
+"""Based on the paper: "rate how well the style transfer results matched the target style"."""
 LOWEST, HIGHEST = "not a match", "perfect"
-"""What 1 and 5 mean, in the paper's words."""
+"""Labels of ratings 1 and 5, from the paper."""
 
 
 def write(folder: Path, seed: int = 0, title: str = "Rating of stylised meshes") -> Path:
-    """Write ``study.html`` of every finished run below ``folder``; returns its path.
+    """Write ``study.html`` with every finished run below ``folder``; return its path.
 
-    ``seed`` enters into the order in which each participant sees the pairs. Raises `UserError`
-    where no pair can be shown, and where one of them can't be shown whole: participants could not
-    judge it.
+    ``seed`` affects the order in which each participant sees the pairs. Raises `UserError` if there
+    is no pair, or if one of them can't be shown completely, since participants couldn't judge it.
     """
     runs = [run for run in folders.find(folder) if run.state == "done"]
     if not runs:
@@ -59,12 +58,12 @@ def write(folder: Path, seed: int = 0, title: str = "Rating of stylised meshes")
 
 
 def _pair(run: Run, folder: Path, blocks: dict[str, str]) -> dict[str, Any]:
-    """A pair's names and the keys of its blocks, which are added to ``blocks`` once each."""
+    """A pair's names and the keys of its data blocks, which are added to ``blocks`` once."""
     shown = shows.read(run)
     if shown.missing:
         raise UserError(
-            f"the run '{run.folder}' can't be rated: {shown.missing[0]} Mend it, or give a folder "
-            "without it."
+            f"the run '{run.folder}' can't be rated: {shown.missing[0]} Repair it, or give a "
+            "folder without it."
         )
     below = run.folder.relative_to(folder).as_posix()
     pair: dict[str, Any] = {"id": below, "label": f"{run.part('source')}-{run.part('style')}"}
@@ -80,7 +79,7 @@ def _pair(run: Run, folder: Path, blocks: dict[str, str]) -> dict[str, Any]:
 
 
 def _distinct(pairs: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Pairs of one source and style get their folders' names, too."""
+    """Add folder names to pairs with the same source and style."""
     labels = [pair["label"] for pair in pairs]
     return [
         pair | {"label": f"{pair['label']} ({pair['id']})"}

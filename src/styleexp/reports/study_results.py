@@ -37,11 +37,11 @@ class Answers:
 
 @dataclass(frozen=True)
 class Study:
-    """All answers that could be read."""
+    """All readable answers."""
 
     answers: list[Answers]
     left_out: list[str]
-    """A sentence for each file that was left out."""
+    """One sentence for each skipped file."""
 
     @property
     def pairs(self) -> dict[str, str]:
@@ -50,20 +50,20 @@ class Study:
 
     @property
     def matrix(self) -> np.ndarray:
-        """Ratings (participants, pairs); NaN where there is none."""
+        """Ratings (participants, pairs); NaN if missing."""
         return np.array(
             [[answer.ratings.get(pair, math.nan) for pair in self.pairs] for answer in self.answers]
         )
 
     @property
     def simulated(self) -> int:
-        """How many participants are simulated."""
+        """Number of simulated participants."""
         return sum(answer.simulated for answer in self.answers)
 
 
 def read(paths: Sequence[Path]) -> Study:
-    """Read the files; those that are broken, of another study or of a participant who is there
-    already are left out. Raises `UserError` where none is left."""
+    """Read answer files, skipping broken ones, those of another study, and duplicates of a
+    participant. Raises `UserError` if none is left."""
     answers: list[Answers] = []
     left_out: list[str] = []
     for path in paths:
@@ -113,7 +113,7 @@ def _read(path: Path) -> Answers:
 
 
 def analyse(study: Study, folder: Path) -> list[Path]:
-    """Write ``fig9.png``, ``fig9.csv``, ``ratings.csv`` and ``study.json``; returns their paths."""
+    """Write ``fig9.png``, ``fig9.csv``, ``ratings.csv`` and ``study.json``; return their paths."""
     target = RunFolder(folder)
     folder.mkdir(parents=True, exist_ok=True)
     rows, found = table(study), summary(study)
@@ -133,7 +133,7 @@ def analyse(study: Study, folder: Path) -> list[Path]:
 
 
 def table(study: Study) -> list[dict[str, Any]]:
-    """A row for each pair: how many rated it, mean, ends of the 95 % confidence interval."""
+    """One row per pair: number of ratings, mean, bounds of the 95 % confidence interval."""
     rows = []
     for label, column in zip(study.pairs.values(), study.matrix.T, strict=True):
         given = column[~np.isnan(column)]
@@ -143,7 +143,7 @@ def table(study: Study) -> list[dict[str, Any]]:
 
 
 def summary(study: Study) -> dict[str, Any]:
-    """The study's numbers as a whole."""
+    """Summary statistics of the study."""
     means = [row["mean"] for row in table(study) if row["n"]]
     return {
         "participants": len(study.answers),
@@ -161,7 +161,7 @@ def summary(study: Study) -> dict[str, Any]:
 
 
 def draw(rows: Sequence[dict[str, Any]], found: dict[str, Any], path: Path) -> None:
-    """Fig. 9: a bar for each pair, from 1 to its mean rating, with the confidence interval."""
+    """Draw Fig. 9: a bar per pair, from 1 to its mean rating, with the confidence interval."""
     try:
         from matplotlib.figure import Figure
     except ImportError:

@@ -1,4 +1,4 @@
-"""The page of a sweep: a grid over the swept axes, a table to sort, and charts for each axis."""
+"""The page of a sweep: a grid over the swept axes, a sortable table, and charts per axis."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from styleexp.reports.folders import Run
 
 NAME = "report.html"
 SEED = "optim.seed"
-"""Runs that differ in it alone share a cell."""
+"""Key of the seed; runs that differ only in it share a cell."""
 OMITTED = "not given"
-"""The value of an axis where a run was not given one."""
+"""Axis value of a run without an override for it."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """Runs with the same values on all axes; none where none was planned."""
+    """Runs with the same values on all axes; empty if none was planned."""
 
     runs: list[Run] = field(default_factory=list)
 
@@ -31,27 +31,27 @@ class Grid:
     """One sheet of the grid: rows and columns are the first two axes."""
 
     title: str
-    """The values of the other axes."""
+    """Values of the remaining axes."""
     rows: list[tuple[str, list[Cell]]]
     columns: list[str]
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """Runs below one folder that belong together."""
+    """Runs below one folder that form a sweep."""
 
     name: str
     runs: list[Run]
     axes: dict[str, list[str]]
-    """Values of each swept key, in the order of the jobs."""
+    """Values of each swept key, in job order."""
 
     def values(self, run: Run) -> tuple[str, ...]:
-        """A run's place on the axes."""
+        """A run's values on the axes."""
         given = settings(run)
         return tuple(given.get(key, OMITTED) for key in self.axes)
 
     def seed_of(self, run: Run) -> str | None:
-        """The seed that a run was given, if seeds are swept."""
+        """A run's seed, if seeds are swept."""
         return settings(run).get(SEED) if self.seeds else None
 
     @property
@@ -60,24 +60,24 @@ class Sweep:
         return len({settings(run).get(SEED) for run in self.runs}) > 1
 
     def label(self, run: Run) -> str:
-        """What tells a run from the others, in words."""
+        """Label that distinguishes a run from the others."""
         told = [f"{k}={v}" for k, v in zip(self.axes, self.values(run), strict=True)]
         seed = self.seed_of(run)
         return ", ".join([*told, *([f"seed {seed}"] if seed else [])]) or run.folder.name
 
     @property
     def row_axis(self) -> str:
-        """The key whose values are the grid's rows; none for a single axis."""
+        """Key of the grid's rows; empty for a single axis."""
         return next(iter(self.axes)) if len(self.axes) > 1 else ""
 
     @property
     def column_axis(self) -> str:
-        """The key whose values are the grid's columns."""
+        """Key of the grid's columns."""
         return list(self.axes)[1] if len(self.axes) > 1 else next(iter(self.axes), "")
 
     @property
     def grids(self) -> list[Grid]:
-        """A sheet for each combination of the axes from the third on."""
+        """One sheet per combination of the axes from the third on."""
         cells: dict[tuple[str, ...], Cell] = {}
         for run in self.runs:
             cells.setdefault(self.values(run), Cell()).runs.append(run)
@@ -98,9 +98,9 @@ class Sweep:
 
 
 def write(folder: Path, run_pages: bool = True) -> Path:
-    """Write the page of all runs below ``folder``; returns its path.
+    """Write the page of all runs below ``folder``; return its path.
 
-    Finished runs without a page get theirs, unless ``run_pages`` is false. Raises `UserError` where
+    Also writes missing pages of finished runs, unless ``run_pages`` is false. Raises `UserError` if
     there is no run.
     """
     runs = folders.find(folder)
@@ -114,7 +114,7 @@ def write(folder: Path, run_pages: bool = True) -> Path:
 
 
 def build(folder: Path, runs: list[Run]) -> str:
-    """The page's text; links are relative to ``folder``."""
+    """Render the page as HTML, with links relative to ``folder``."""
     sweeps = split(folder, runs)
     return html.render(
         "sweep.html",
@@ -131,7 +131,7 @@ def build(folder: Path, runs: list[Run]) -> str:
 
 
 def split(folder: Path, runs: list[Run]) -> list[Sweep]:
-    """The runs of each sweep: those whose folders lie side by side."""
+    """Group runs into sweeps by their parent folder."""
     together: dict[Path, list[Run]] = {}
     for run in runs:
         together.setdefault(run.folder.parent, []).append(run)
@@ -143,7 +143,7 @@ def split(folder: Path, runs: list[Run]) -> list[Sweep]:
 
 
 def axes(runs: list[Run]) -> dict[str, list[str]]:
-    """Keys whose values differ between the runs, with their values; numbers in their order."""
+    """Keys whose values differ between runs, with their values; numbers are sorted."""
     given = [settings(run) for run in runs]
     keys = dict.fromkeys(key for each in given for key in each if key != SEED)
     found = {}
@@ -155,14 +155,13 @@ def axes(runs: list[Run]) -> dict[str, list[str]]:
 
 
 def settings(run: Run) -> dict[str, str]:
-    """A run's overrides by key, without Hydra's marks; its own settings (``hydra.*``) are no
-    one's axis."""
+    """A run's overrides by key, without Hydra's prefixes and without ``hydra.*`` keys."""
     pairs = (override.lstrip("+~").partition("=") for override in run.overrides)
     return {key: value for key, _, value in pairs if not key.startswith("hydra")}
 
 
 def headline(run: Run) -> tuple[str, float] | None:
-    """The number that is shown below a run's picture: what says most about its result."""
+    """The most informative metric of a run, shown below its picture."""
     for name in ("style_distance", "loss"):
         if name in run.summary:
             return name, run.summary[name]
@@ -170,13 +169,13 @@ def headline(run: Run) -> tuple[str, float] | None:
 
 
 def measures(sweep: Sweep) -> list[str]:
-    """Names of all numbers that some run of the sweep has."""
+    """Names of all numbers that any run of the sweep has."""
     first = [told[0] for run in sweep.runs if (told := headline(run))]
     return list(dict.fromkeys([*first, *(name for run in sweep.runs for name in run.summary)]))
 
 
 def plots(sweep: Sweep) -> list[dict[str, Any]]:
-    """A chart for each axis and each number."""
+    """One chart per axis and number."""
     made = []
     for name in measures(sweep):
         for number, (key, values) in enumerate(sweep.axes.items()):
@@ -203,7 +202,7 @@ def _picture(run: Run) -> str | None:
 
 
 def _link(run: Run, folder: Path) -> str | None:
-    """The run's page as seen from the sweep's."""
+    """Relative link from the sweep's page to the run's."""
     from urllib.parse import quote
 
     if not (run.folder / page.NAME).is_file():

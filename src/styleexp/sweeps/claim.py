@@ -1,8 +1,8 @@
-"""A run's or a sweep's folder is its own, from before Hydra writes the first file into it.
+"""Claim the folder of a run or sweep before Hydra writes the first file into it.
 
-A folder that is named by the time gets another name where that one is taken: two commands of one
-second would share it. A folder that the user named is refused while another process is at it, and
-a sweep's also where it holds the results of other jobs.
+A folder named by the time gets a suffix if it is taken, since two commands in the same second would
+share it. A folder named by the user is refused while another process uses it; a sweep's also if it
+contains results of other jobs.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ if TYPE_CHECKING:
     from styleexp.config import Config
 
 PATIENCE = 2.0
-"""Seconds to wait for a folder: who only looks whether it is held, holds it for a moment."""
+"""Seconds to wait for a folder, because checking whether it is held locks it briefly."""
 
 
 def run(config: DictConfig) -> None:
-    """Claim the folder of a single run; ``config`` then names it.
+    """Claim the folder of a single run, and set it in ``config``.
 
-    Raises `UserError` where another process is at work in a folder that the user named.
+    Raises `UserError` if the user named the folder and another process is using it.
     """
     _claim(config, "run")
 
 
 def sweep(config: DictConfig) -> Path:
-    """The same for a sweep, whose jobs are noted in ``jobs.json``; returns its folder.
+    """Claim the folder of a sweep, record its jobs in ``jobs.json``, and return the folder.
 
-    Raises `UserError` also where the folder holds results of other jobs.
+    Raises `UserError` like `run`, and if the folder contains results of other jobs.
     """
     folder = _claim(config, "sweep")
     try:
@@ -61,8 +61,7 @@ def sweep(config: DictConfig) -> Path:
 
 
 def _claim(config: DictConfig, kind: str) -> Path:
-    """Lock the folder ``hydra.KIND.dir``, or one beside it where that is taken and any name
-    will do."""
+    """Lock the folder ``hydra.KIND.dir``, or a sibling if it is taken and its name is arbitrary."""
     from omegaconf import OmegaConf, open_dict, read_write
 
     named = f"hydra.{kind}.dir"
@@ -80,29 +79,28 @@ def _claim(config: DictConfig, kind: str) -> Path:
     if fresh != folder:
         with read_write(config.hydra), open_dict(config.hydra):
             config.hydra[kind].dir = str(fresh)
-            # A sweep's jobs are composed anew, with these.
+            # A sweep's jobs are composed again, with these.
             config.hydra.overrides.hydra.append(f"{named}={quote(str(fresh))}")
     return fresh
 
 
 def busy(folder: Path, kind: str = "run") -> str:
-    """What is said of a folder that another process holds."""
+    """Error message for a folder that another process holds."""
     return (
-        f"another process is at work in '{folder}': wait for it, or choose another folder with "
+        f"another process is using '{folder}': wait for it, or choose another folder with "
         f"hydra.{kind}.dir=FOLDER."
     )
 
 
 def _fresh(folder: Path) -> Path:
-    """Make and lock a folder that nobody has: this one, or the first free one of its name with a
-    number."""
+    """Create and lock an unused folder: this one, or the first free one with a number appended."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     for each in _names(folder):
         with suppress(FileExistsError, locks.Busy):
             each.mkdir()
             locks.take(each)
             return each
-    raise AssertionError("there is always another number")
+    raise AssertionError("unreachable")
 
 
 def _names(folder: Path) -> Iterator[Path]:
@@ -112,8 +110,8 @@ def _names(folder: Path) -> Iterator[Path]:
 
 
 def _jobs(config: DictConfig, folder: Path, configs: list[Config]) -> list[Job] | None:
-    """The sweep's jobs with their keys; None where the sweeper finds them as it goes. Their
-    configurations are appended to ``configs``."""
+    """The sweep's jobs with their keys; None if the sweeper generates them dynamically. Appends
+    their configurations to ``configs``."""
     from hydra.core.global_hydra import GlobalHydra
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import open_dict
@@ -127,7 +125,7 @@ def _jobs(config: DictConfig, folder: Path, configs: list[Config]) -> list[Job] 
     jobs, before = [], HydraConfig.instance().cfg
     for number, overrides in enumerate(listed):
         key = None
-        # What can't be composed ends the sweep, or fails the job: Hydra or the job will say so.
+        # If composing fails, Hydra or the job itself reports the error.
         with suppress(Exception):
             composed = loader.load_sweep_config(config, list(overrides))
             with open_dict(composed):
@@ -142,8 +140,8 @@ def _jobs(config: DictConfig, folder: Path, configs: list[Config]) -> list[Job] 
 
 
 def _given(config: DictConfig) -> list[str]:
-    """The command's overrides in Hydra's grammar: resolved, an escaped "${" of a file's name would
-    be lost."""
+    """The command's overrides in Hydra's grammar; resolving would lose an escaped "${" in a file's
+    name."""
     from omegaconf import OmegaConf
 
     given: Any = OmegaConf.to_container(config.hydra.overrides.task, resolve=False)
@@ -151,7 +149,7 @@ def _given(config: DictConfig) -> list[str]:
 
 
 def _search(config: DictConfig) -> dict[str, Any]:
-    """What a search asks for, as its jobs aren't known beforehand."""
+    """Description of a search, whose jobs aren't known in advance."""
     from omegaconf import OmegaConf
 
     return {
@@ -163,17 +161,19 @@ def _search(config: DictConfig) -> dict[str, Any]:
 
 
 def _refuse_others(folder: Path, jobs: Sequence[Job], content: dict[str, Any]) -> None:
-    """Raise `UserError` where a folder holds results of jobs that aren't these. What failed for
-    another reason than these jobs have may be tried again."""
+    """Raise `UserError` if a folder contains results of other jobs. Failed jobs may be
+    overwritten."""
     told = "choose another folder with hydra.sweep.dir=FOLDER, or remove it."
     before = listed(folder)
     if before is not None:
         asked = "jobs" if "jobs" in content else "search"
         if before.get(asked) != json.loads(json.dumps(content[asked])):
-            raise UserError(f"'{folder}' holds another sweep: {told}")
+            raise UserError(f"'{folder}' contains another sweep: {told}")
     for job in jobs:
         found = runs.of_job(job)
         if found["status"] == "newer":
             raise UserError(f"cannot run in '{job.folder}': {found['reason']}")
         if found["status"] == "other" and runs.status(job.folder) != "failed":
-            raise UserError(f"'{job.folder}' is not this sweep's, {found['reason']}: {told}")
+            raise UserError(
+                f"'{job.folder}' doesn't belong to this sweep ({found['reason']}): {told}"
+            )

@@ -18,16 +18,17 @@ if TYPE_CHECKING:
     from styleexp.config import Config
 
 COLUMNS = 6
-"""Pictures in a line, at most, where settings would make it longer."""
+"""Maximum number of pictures per line, for many settings."""
 PAIRS = 2
-"""Pairs of source and style in a line, where each has one result."""
+"""Source-style pairs per line, if each has one result."""
 MOST = 240
-"""Jobs in a sheet: at 512 pixels a picture more would not open in a browser."""
+"""Maximum number of jobs per sheet; with 512-pixel pictures, larger sheets don't open in a
+browser."""
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What the layout needs to know of a job."""
+    """A job's properties that the layout depends on."""
 
     source: str
     style: str
@@ -48,10 +49,10 @@ Line = list[Cell | None]
 
 
 def layout(shown: Sequence[Shown]) -> list[Line]:
-    """The sheet's lines.
+    """Lay out the sheet's lines.
 
-    Settings that vary: source, style, and a column for each setting (Figs. 7, 8). All pairs of some
-    sources and styles: a grid with styles above and sources on the left (Figs. 2, 3). Other pairs:
+    Varying settings: source, style, and one column per setting (Figs. 7, 8). All pairs of some
+    sources and styles: a grid with styles on top and sources on the left (Figs. 2, 3). Other pairs:
     source, style, result (Fig. 9).
     """
     pairs: dict[tuple[str, str], list[int]] = {}
@@ -113,8 +114,8 @@ def _results(shown: Sequence[Shown], jobs: Sequence[int]) -> list[Cell]:
 
 
 def write_figure(jobs: Sequence[Job], folder: RunFolder) -> None:
-    """Draw ``figure.png`` of the first `MOST` jobs; one without a result has its status in the
-    picture's place."""
+    """Draw ``figure.png`` of the first `MOST` jobs; a job without a result shows its status
+    instead."""
     told = varying([job.overrides for job in jobs])
     records = [_record(job) for job in jobs[:MOST]]
     configs = [_config(job, record) for job, record in zip(jobs[:MOST], records, strict=True)]
@@ -145,7 +146,7 @@ def write_figure(jobs: Sequence[Job], folder: RunFolder) -> None:
 
 
 def _record(job: Job) -> dict[str, Any]:
-    """A job's record; empty where there is none of its own."""
+    """A job's record; empty if it has none."""
     from styleexp import identity
 
     try:
@@ -156,7 +157,7 @@ def _record(job: Job) -> dict[str, Any]:
 
 
 def _config(job: Job, record: dict[str, Any]) -> Config:
-    """A job's configuration, from its record or, where it never began, from its overrides."""
+    """A job's configuration, from its record or, if it never started, from its overrides."""
     from styleexp import compose
 
     if "config" in record:
@@ -172,7 +173,7 @@ def _name(part: Any) -> str:
 def _picture(
     kind: str, config: Config, job: Job, record: dict[str, Any], size: int
 ) -> Image.Image | str:
-    """A picture no larger than ``size``, or words where there is none."""
+    """A picture no larger than ``size``, or a text if there is none."""
     import copy
 
     import numpy as np
@@ -214,7 +215,7 @@ def _view(mesh: Any, size: int) -> Image.Image:
 
 
 def _sheet(lines: list[list[tuple[str, Image.Image | str] | None]], size: int) -> Image.Image:
-    """Captioned pictures in lines; a caption that is too long for its picture is cut."""
+    """Captioned pictures in lines; captions longer than their picture are truncated."""
     from PIL import Image, ImageDraw, ImageFont
 
     band = max(16, size // 12)

@@ -1,4 +1,4 @@
-"""The jobs of a sweep: which there are, and what tells them apart."""
+"""The jobs of a sweep, and the settings that distinguish them."""
 
 from __future__ import annotations
 
@@ -11,42 +11,42 @@ from typing import Any
 from styleexp import identity
 
 GROUPS = ("source", "style", "pair")
-"""Keys that choose what is stylised; all others are settings."""
+"""Keys that choose source and style; all others are settings."""
 
 
 JOBS = "jobs.json"
-"""What was planned: so a job that never began is seen as missing."""
+"""File that lists the planned jobs, so that a job that never started is reported as missing."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run of a sweep, begun or not."""
+    """One run of a sweep, started or not."""
 
     name: str
-    """Unique in the sweep; its number where Hydra counts."""
+    """Name, unique in the sweep; Hydra's job number in Hydra's sweeps."""
     overrides: tuple[str, ...]
     folder: Path
     key: str | None = None
-    """Of the run that it asks for (`styleexp.identity`); earlier versions noted none."""
+    """Key of the requested run (`styleexp.identity`); None for sweeps of earlier versions."""
 
 
 def listed(folder: Path) -> dict[str, Any] | None:
-    """A sweep's ``jobs.json``: its ``jobs`` as lists of overrides and their ``keys``, which earlier
-    versions didn't note, or the ``search`` that finds them. None where there is none to be read."""
+    """A sweep's ``jobs.json``: its ``jobs`` as lists of overrides and their ``keys`` (missing in
+    earlier versions), or the ``search`` that generates them. None if missing or unreadable."""
     try:
         content = json.loads((folder / JOBS).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
     jobs = content.get("jobs", []) if isinstance(content, dict) else None
     if not isinstance(jobs, list) or not all(isinstance(each, list) for each in jobs):
-        return None  # another program's file of that name
+        return None  # a file of another program
     return content
 
 
 def planned(folder: Path) -> list[Job]:
-    """The jobs of Hydra's sweep in ``folder``, in order, with or without a folder of their own.
+    """The jobs of Hydra's sweep in ``folder``, in order, whether their folders exist or not.
 
-    Where they weren't known beforehand (as with Optuna), those that were begun.
+    If they weren't known in advance (as with Optuna), the jobs that were started.
     """
     content = listed(folder)
     if content is None or "jobs" not in content:
@@ -63,7 +63,7 @@ def planned(folder: Path) -> list[Job]:
 
 
 def _begun(folder: Path) -> Job:
-    """The job of a search that a folder's own record tells of."""
+    """The search job described by a folder's own record."""
     try:
         record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
         return Job(folder.name, tuple(record["overrides"]), folder, identity.of(record))
@@ -72,8 +72,7 @@ def _begun(folder: Path) -> Job:
 
 
 def _placed(jobs: list[Job], folder: Path) -> list[Job]:
-    """The jobs with the folders that hold their runs: ``hydra.sweep.subdir`` may name them in
-    another way than by number."""
+    """Set the jobs' folders, which ``hydra.sweep.subdir`` may name other than by number."""
     if all((job.folder / "run.json").exists() for job in jobs):
         return jobs
     found = {_begun(path.parent).key: path.parent for path in folder.rglob("run.json")}
@@ -87,11 +86,10 @@ def _placed(jobs: list[Job], folder: Path) -> list[Job]:
 
 
 def product(params: Mapping[str, str] | None, overrides: Sequence[str]) -> list[list[str]]:
-    """The jobs of Hydra's basic sweeper, in its order, as lists of overrides.
+    """The jobs of Hydra's basic sweeper, in order, as lists of overrides.
 
-    ``params`` are those of ``hydra.sweeper``; ``overrides`` of the same key take their place.
-    Raises Hydra's exceptions for what can't be parsed or is no list of values. Needs an initialised
-    Hydra.
+    ``params`` are those of ``hydra.sweeper``; ``overrides`` with the same key replace them. Raises
+    Hydra's exceptions for values that can't be parsed or aren't a list. Needs an initialised Hydra.
     """
     from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
     from hydra.core.global_hydra import GlobalHydra
@@ -104,7 +102,7 @@ def product(params: Mapping[str, str] | None, overrides: Sequence[str]) -> list[
 
 
 def varying(jobs: Sequence[Sequence[str]]) -> list[dict[str, str]]:
-    """For each job those of its overrides that not all jobs have, without Hydra's ``+``."""
+    """For each job, the overrides that not all jobs share, without Hydra's ``+``."""
     split = [dict(_pair(override) for override in overrides) for overrides in jobs]
     keys = dict.fromkeys(key for each in split for key in each)
     told = [key for key in keys if len({each.get(key) for each in split}) > 1]
@@ -112,12 +110,12 @@ def varying(jobs: Sequence[Sequence[str]]) -> list[dict[str, str]]:
 
 
 def setting(overrides: Mapping[str, str]) -> str:
-    """A short label of the overrides that are settings: ``high``, ``field.sigma=5``."""
+    """A short label of the overrides that are settings, such as ``high`` or ``field.sigma=5``."""
     return ", ".join(_label(k, v) for k, v in overrides.items() if k.split(".")[0] not in GROUPS)
 
 
 def readable(overrides: Mapping[str, str]) -> str:
-    """The overrides as they are typed, for a table."""
+    """The overrides as typed, for a table."""
     return " ".join(f"{key}={value}" for key, value in overrides.items())
 
 

@@ -1,4 +1,4 @@
-"""Hydra's launchers: how many jobs run side by side, and how many threads each gets."""
+"""Hydra's launchers: number of parallel jobs, and threads per job."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from styleexp.errors import UserError
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores available to this process."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -21,25 +21,25 @@ JOBS = {
     "submitit_slurm": "hydra.launcher.array_parallelism",
     "ray": "hydra.launcher.ray.init.num_cpus",
 }
-"""The key of each launcher that says how many jobs run at once."""
+"""Each launcher's key for the number of parallel jobs."""
 MANY = 100
-"""Jobs given at once to launchers that keep what each returned, 0.2 MB with its configuration."""
+"""Jobs per batch for launchers that keep every return value, 0.2 MB with its configuration."""
 
 
 def overrides(name: str, jobs: int | None = None) -> list[str]:
-    """The overrides that choose a launcher, and how many jobs it runs side by side."""
+    """Overrides that choose a launcher and its number of parallel jobs."""
     if jobs is None:
         return [f"launcher={name}"]
     if name not in JOBS or jobs < 1:
         raise UserError(
-            f"--jobs {jobs} can't be done with the launcher '{name}': choose --launcher joblib and "
+            f"--jobs {jobs} is not possible with the launcher '{name}': use --launcher joblib and "
             "a number from 1."
         )
     return [f"launcher={name}", f"{JOBS[name]}={jobs}"]
 
 
 def batch_size(hydra: Any) -> int | None:
-    """How many jobs the launcher may be given at once; None for any number."""
+    """Maximum number of jobs per batch for the launcher; None for no limit."""
     kind = _kind(hydra)
     if kind == "submitit_local":
         return side_by_side(hydra)
@@ -47,7 +47,7 @@ def batch_size(hydra: Any) -> int | None:
 
 
 def side_by_side(hydra: Any) -> int:
-    """Jobs that run at once on one machine, by Hydra's configuration (``hydra.launcher``)."""
+    """Number of parallel jobs on one machine, from Hydra's configuration (``hydra.launcher``)."""
     kind = _kind(hydra)
     if kind == "joblib":
         jobs = int(hydra.launcher.n_jobs)
@@ -58,7 +58,7 @@ def side_by_side(hydra: Any) -> int:
 
 
 def threads_each(hydra: Any) -> int:
-    """Threads for each job, so that jobs side by side don't fight for cores; 0 takes all cores."""
+    """Threads per job, so that parallel jobs don't compete for cores; 0: all cores."""
     kind = _kind(hydra)
     if kind == "submitit_slurm":
         return int(hydra.launcher.cpus_per_task or 0)

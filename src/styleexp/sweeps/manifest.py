@@ -1,7 +1,7 @@
-"""What a plan's folder holds: every job with its key, state and folder, in ``manifest.json``.
+"""A plan's ``manifest.json``: every job with its key, state and folder.
 
-The truth about a job is in its own folder: the status that it wrote, and the lock that its process
-holds. The manifest is for people and for what comes after; it is written under a lock of its own.
+A job's own folder is authoritative: the status it wrote, and the lock its process holds. The
+manifest is for people and later tools; it has its own lock.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ SCHEMA = 1
 PATIENCE = 60.0
 """Seconds to wait for the manifest's lock."""
 ENDED = ("done", "failed")
-"""States in which a job stays."""
+"""Final states of a job."""
 
 
 def write(folder: Path, jobs: Iterable[Planned]) -> None:
-    """Note the jobs of a plan; what the folder holds of other plans, or of this one before it was
-    changed, is marked as outdated."""
+    """Write the jobs of a plan; jobs of other plans, or of an earlier version of this one, are
+    marked as outdated."""
     with locks.hold(folder, PATIENCE):
         before = read(folder)
         listed = {}
@@ -50,32 +50,33 @@ def write(folder: Path, jobs: Iterable[Planned]) -> None:
 
 
 def refuse_others(job: Planned, found: dict[str, Any]) -> None:
-    """Raise `UserError` where a job's folder holds another run, or a later version's."""
+    """Raise `UserError` if a job's folder contains another run, or one of a later version."""
     if found["status"] == "newer":
         raise UserError(f"cannot run in '{job.folder}': {found['reason']}")
     if found["status"] == "other":
         raise UserError(
-            f"'{job.folder}' is not this plan's, {found['reason']}: move it away, or choose "
-            "another --folder."
+            f"'{job.folder}' doesn't belong to this plan ({found['reason']}): move it away, or "
+            "choose another --folder."
         )
 
 
 def read(folder: Path) -> dict[str, dict[str, Any]]:
-    """The manifest's jobs, by their folder below the plan's; empty where there is none."""
+    """The manifest's jobs, keyed by their folder below the plan's; empty if there is no
+    manifest."""
     path = folder / NAME
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return {}
     except (OSError, ValueError) as error:
-        raise UserError(f"'{path}' can't be read ({error}): remove it; runs are kept.") from error
+        raise UserError(f"'{path}' can't be read ({error}): remove it (runs are kept).") from error
     if content.get("schema") != SCHEMA:
         raise UserError(f"'{path}' was written by another version: choose another --folder.")
     return dict(content["jobs"])
 
 
 def update(folder: Path, name: str, state: str) -> dict[str, dict[str, Any]]:
-    """Note a job's new state, and where it runs; returns all jobs."""
+    """Record a job's new state and host; return all jobs."""
     with locks.hold(folder, PATIENCE):
         jobs = read(folder)
         job = jobs.setdefault(name, {})
@@ -88,10 +89,10 @@ def update(folder: Path, name: str, state: str) -> dict[str, dict[str, Any]]:
 
 
 def home(folder: Path) -> Path | None:
-    """The working folder in which a plan was begun, that its relative paths start from."""
+    """The working folder in which a plan was started, which its relative paths refer to."""
     try:
         return Path(json.loads((folder / NAME).read_text(encoding="utf-8"))["begun_in"])
-    except (OSError, ValueError, KeyError, TypeError):  # or an earlier version's
+    except (OSError, ValueError, KeyError, TypeError):  # missing, or of an earlier version
         return None
 
 

@@ -1,16 +1,16 @@
-"""Plans: which experiments, with which seeds and sizes, in which order.
+"""Plans: experiments with their seeds and sizes, in order.
 
 A plan is a YAML file (``sweeps/*.yaml``)::
 
-    profile: fast                 # of every job; on the command line: profile=standard
+    profile: fast                 # for every job; on the command line: profile=standard
     launcher: basic               # an option of conf/launcher
-    seeds: [0]                    # optim.seed, where an experiment sweeps none itself
-    overrides: [encoder=vgg16]    # of every job
+    seeds: [0]                    # optim.seed, unless an experiment sweeps it
+    overrides: [encoder=vgg16]    # for every job
     experiments:
-      - experiment: sigma_ablation          # one of conf/experiment, swept as it says
+      - experiment: sigma_ablation          # a name in conf/experiment, swept as defined there
         figure: Fig. 7
-        minutes: {fast: 3, standard: 8}     # what all its jobs take on two cores
-      - name: pairs                         # or without an experiment
+        minutes: {fast: 3, standard: 8}     # duration of all its jobs on two cores
+      - name: pairs                         # or without an experiment's name
         pairs: [[spot, stripe], [bunny, bubble]]    # source and style, not their product
         overrides: ["field.sigma=1,5"]
 """
@@ -38,21 +38,21 @@ class Entry:
 
     experiment: str | None = None
     name: str | None = None
-    """Of its folder; the experiment's if not given."""
+    """Name of its folder; default: the experiment's name."""
     figure: str = ""
-    """The paper's figure that it is for."""
+    """The paper's figure that it reproduces."""
     minutes: dict[str, float] = option(default_factory=dict)
-    """What all its jobs take on two cores, by profile."""
+    """Total minutes of its jobs on two cores, by profile."""
     overrides: list[str] = option(default_factory=list)
     pairs: list[list[str]] = option(default_factory=list)
     """Pairs of source and style."""
     seeds: list[int] | None = None
-    """Instead of the plan's."""
+    """Seeds that replace the plan's."""
 
 
 @dataclass
 class Plan:
-    """Experiments in their order."""
+    """Experiments in order."""
 
     experiments: list[Entry]
     profile: str = "standard"
@@ -68,13 +68,13 @@ class Planned(Job):
     entry: str = ""
 
     def command(self) -> str:
-        """The command that does the same."""
+        """The equivalent command."""
         target = f"hydra.run.dir={quote(str(self.folder))}"
         return shlex.join(["styleexp", *self.overrides, "hydra.mode=RUN", target])
 
 
 def read(path: Path) -> Plan:
-    """Read and check a plan. Raises `UserError` for what it can't be."""
+    """Read and validate a plan. Raises `UserError` if it is invalid."""
     import yaml
 
     try:
@@ -85,7 +85,7 @@ def read(path: Path) -> Plan:
         told = " ".join(str(error).split())
         raise UserError(f"the plan '{path}' can't be read: {told}.") from error
     if not isinstance(content, dict) or not content.get("experiments"):
-        raise UserError(f"the plan '{path}' names no experiments: see sweeps/ for examples.")
+        raise UserError(f"the plan '{path}' lists no experiments: see sweeps/ for examples.")
     entries = []
     for number, each in enumerate(content["experiments"], 1):
         entry = _typed(Entry, each, f"experiment {number} of '{path}'")
@@ -103,13 +103,13 @@ def read(path: Path) -> Plan:
 
 
 def _typed(schema: Any, content: Any, where: str) -> Any:
-    """The dataclass of a mapping, its keys and types checked."""
+    """Convert a mapping to a dataclass, checking keys and types."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
     known = [each.name for each in dataclasses.fields(schema)]
     if not isinstance(content, dict):
-        raise UserError(f"{where} is no mapping: its keys are {', '.join(known)}.")
+        raise UserError(f"{where} must be a mapping with the keys {', '.join(known)}.")
     made = OmegaConf.structured(schema)
     for key, value in content.items():
         if key not in known:
@@ -122,7 +122,7 @@ def _typed(schema: Any, content: Any, where: str) -> Any:
 
 
 def experiment_jobs(overrides: Sequence[str]) -> list[list[str]]:
-    """The jobs that ``styleexp -m`` makes of these overrides, as lists of overrides."""
+    """The jobs that ``styleexp -m`` creates from these overrides, as lists of overrides."""
     import hydra
 
     from styleexp import compose
@@ -133,7 +133,7 @@ def experiment_jobs(overrides: Sequence[str]) -> list[list[str]]:
 
 
 def _params(overrides: Sequence[str]) -> Mapping[str, str]:
-    """The sweep that a configuration asks for by itself. Needs an initialised Hydra."""
+    """The sweep parameters that a configuration defines. Needs an initialised Hydra."""
     from hydra.core.global_hydra import GlobalHydra
     from hydra.types import RunMode
 
@@ -145,10 +145,10 @@ def _params(overrides: Sequence[str]) -> Mapping[str, str]:
 
 
 def jobs(plan: Plan, folder: Path, overrides: Sequence[str] = ()) -> dict[str, list[Planned]]:
-    """The jobs of every experiment of a plan, by its name, in their order.
+    """The jobs of every experiment of a plan, keyed by its name, in order.
 
-    Jobs with the same key, be they of different experiments, share one folder and run once. Raises
-    `UserError`, and Hydra's exceptions, for what can't be composed.
+    Jobs with the same key share one folder and run once, even across experiments. Raises
+    `UserError` and Hydra's exceptions if composing fails.
     """
     import hydra
 
@@ -188,7 +188,7 @@ def _parts(plan: Plan, entry: Entry, overrides: Sequence[str]) -> Iterator[list[
 
 
 def _readable(overrides: Mapping[str, str]) -> str:
-    """The overrides that tell a job from the others, as a file's name."""
+    """The overrides that distinguish a job, as a file name."""
     words = [
         v if "." not in k or k == "source.path" else f"{k.split('.')[-1]}{v}"
         for k, v in overrides.items()

@@ -1,4 +1,4 @@
-"""The end of a sweep: its table, its figure, and the exit code that tells whether all went well."""
+"""End of a sweep: table, figure and exit code."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 begun: Path | None = None
-"""The folder of the sweep that this process began, if it did."""
+"""The folder of the sweep that this process started, if any."""
 
 
 class OnSweep(Callback):
-    """Hydra's callback: note the jobs at the start of a sweep, report at its end."""
+    """Hydra callback: record the jobs at the start of a sweep, report at its end."""
 
     def on_run_start(self, config: DictConfig, **rest: Any) -> None:
         """Claim the run's folder before Hydra writes into it."""
         _claimed(claim.run, config)
 
     def on_multirun_start(self, config: DictConfig, **rest: Any) -> None:
-        """Claim the sweep's folder and note its jobs, as far as they are known beforehand."""
+        """Claim the sweep's folder and record its jobs, if known in advance."""
         global begun
         begun = _claimed(claim.sweep, config)
 
     def on_multirun_end(self, config: DictConfig, **rest: Any) -> None:
-        """Write and show what came out."""
+        """Write and print the results."""
         finish(Path(config.hydra.sweep.dir))
 
 
 def _claimed(claim_: Callable[[DictConfig], T], config: DictConfig) -> T | None:
-    """What claiming returns. Hydra swallows all exceptions of callbacks but that which ends the
-    process; where a folder can't be made, it says so itself."""
+    """Call ``claim_`` and exit on a user error, because Hydra swallows all exceptions of callbacks
+    except `SystemExit`. Hydra itself reports a folder that can't be created."""
     try:
         return claim_(config)
     except UserError as error:
@@ -54,20 +54,20 @@ def _claimed(claim_: Callable[[DictConfig], T], config: DictConfig) -> T | None:
 
 
 def exit_code(folder: Path) -> int:
-    """0 if every job of the sweep is done, else 2; by the jobs' own status, whoever ran them."""
+    """0 if every job of the sweep is done, else 2; based on the jobs' own status."""
     states = {runs.of_job(job)["status"] for job in planned(folder)}
     return 0 if states == {"done"} else 2
 
 
 def finish(folder: Path, name: str | None = None) -> None:
-    """Table and figure of Hydra's sweep in ``folder``."""
+    """Write table and figure of Hydra's sweep in ``folder``."""
     report(planned(folder), folder, name or str(folder))
 
 
 def report(jobs: Sequence[Job], folder: Path, title: str) -> None:
-    """Write ``table.csv`` and ``figure.png`` into ``folder`` and show the table.
+    """Write ``table.csv`` and ``figure.png`` into ``folder`` and print the table.
 
-    The figure is drawn anew only where the table has changed.
+    The figure is redrawn only if the table has changed.
     """
     from styleexp.sweeps.figure import MOST, write_figure
 
@@ -79,7 +79,7 @@ def report(jobs: Sequence[Job], folder: Path, title: str) -> None:
     show(rows, title)
     _print(f"{folder / 'figure.png'}, {folder / 'table.csv'}")
     if len(jobs) > MOST:
-        _print(f"figure.png shows the first {MOST} of {len(jobs)} jobs, the table all of them.")
+        _print(f"figure.png shows the first {MOST} of {len(jobs)} jobs; the table shows all.")
 
 
 def _content(path: Path) -> bytes | None:
@@ -87,8 +87,8 @@ def _content(path: Path) -> bytes | None:
 
 
 def table(jobs: Sequence[Job]) -> list[dict[str, Any]]:
-    """A row for each job: ``job``, the overrides that tell it from the others (their keys begin
-    with ``=``), ``status``, ``seconds``, ``loss``, every metric by its name, and ``reason``."""
+    """One row per job: ``job``, the overrides that distinguish it (keys prefixed with ``=``),
+    ``status``, ``seconds``, ``loss``, every metric by its name, and ``reason``."""
     rows = []
     for job, overrides in zip(jobs, varying([job.overrides for job in jobs]), strict=True):
         run = runs.of_job(job)
@@ -102,7 +102,7 @@ def table(jobs: Sequence[Job]) -> list[dict[str, Any]]:
 
 
 def write_table(rows: Sequence[dict[str, Any]], folder: Path) -> None:
-    """``table.csv``: a line for each job, a column for whatever any of them has."""
+    """Write ``table.csv``: one line per job, and a column for every key of any job."""
     keys = [*dict.fromkeys(key for row in rows for key in row if key != "reason"), "reason"]
 
     def write(path: Path) -> None:
@@ -115,7 +115,7 @@ def write_table(rows: Sequence[dict[str, Any]], folder: Path) -> None:
 
 
 def show(rows: Sequence[dict[str, Any]], title: str) -> None:
-    """The table on the terminal."""
+    """Print the table to the terminal."""
     from rich.table import Table
 
     shown = Table(title=title)
@@ -138,7 +138,7 @@ def show(rows: Sequence[dict[str, Any]], title: str) -> None:
         if row["reason"]:
             _print(f"{row['job']}: {row['status']}: {row['reason']}")
     if rows and not any("style_distance" in row for row in rows):
-        _print("style distance: not measured (metrics.judge=none, or no run is done)")
+        _print("style distance: not measured (metrics.judge=none, or no finished run)")
 
 
 def _number(value: Any) -> str:
@@ -150,5 +150,5 @@ def _print(what: Any) -> None:
 
     console = Console()
     if not console.is_terminal:
-        console = Console(width=120)  # a log has no width; keep the columns' names whole
+        console = Console(width=120)  # a log has no width; don't wrap column names
     console.print(what, soft_wrap=isinstance(what, str), markup=not isinstance(what, str))

@@ -1,8 +1,8 @@
-"""Runs a plan: whatever is not done yet, through one of Hydra's launchers, until nothing is left.
+"""Run a plan: launch unfinished jobs through a Hydra launcher until none is left.
 
-A job is claimed by the lock of its own folder, which its process holds as long as it lives. So any
-number of runners may work on one plan, on one machine or on several that share its folder; a runner
-or a worker that is killed leaves a job that is resumed from its checkpoint.
+A job is claimed by the lock of its own folder, which its process holds until it ends. So any number
+of runners can work on one plan, on one machine or on several that share its folder. If a runner or
+worker is killed, its job is resumed from its checkpoint.
 """
 
 from __future__ import annotations
@@ -32,25 +32,25 @@ if TYPE_CHECKING:
     from styleexp.sweeps.plan import Planned
 
 LOG = "log.txt"
-"""In a job's folder: what it printed."""
+"""File in a job's folder with its output."""
 MOST_DEATHS = 3
-"""A job whose process died so often, with no other job beside it, has failed."""
+"""Number of times a job's process may die while running alone before the job counts as failed."""
 AT_WORK = threading.Lock()
-"""Held by this process while it is at a job."""
+"""Held by this process while it runs a job."""
 POLL = 1.0
-"""Seconds between looks at jobs that other runners are at."""
+"""Seconds between polls of jobs that other runners execute."""
 
 
 def run(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> None:
-    """Run what is neither done nor failed, and wait for what other runners are at.
+    """Run all jobs that are neither done nor failed, and wait for those of other runners.
 
-    ``launcher`` are overrides of Hydra's own configuration, ``launcher=...`` among them. Raises
-    `UserError` where the launcher itself fails without a job having begun.
+    ``launcher`` are overrides of Hydra's own configuration, including ``launcher=...``. Raises
+    `UserError` if the launcher itself fails before any job started.
     """
     deaths: Counter[str] = Counter()
     suspects: set[str] = set()
     while True:
-        if not (folder / manifest.NAME).exists():  # the folder was removed under us
+        if not (folder / manifest.NAME).exists():  # the folder was removed meanwhile
             manifest.write(folder, jobs)
         states = {}
         for job in jobs:
@@ -66,14 +66,14 @@ def run(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> None:
                 return
             time.sleep(POLL)
             continue
-        # A worker that dies may take the others with it: what died is tried again alone.
+        # A dying worker may kill the others: retry dead jobs one at a time.
         batch = [job for job in waiting if job.name not in suspects] or waiting[:1]
         before = _progress(folder, batch)
         error = _launch(batch, folder, launcher)
         after = {job.name: runs.of_job(job)["status"] for job in batch}
         died = [name for name, state in after.items() if state == "died"]
         if error is not None and not set(after.values()) & set(manifest.ENDED):
-            # Nothing came of it: some job can't even leave a status, as in a folder without space.
+            # No progress: some job can't even write a status, for example for lack of space.
             died = [name for name, state in after.items() if state != "running"]
         if len(batch) == 1:
             deaths.update(died)
@@ -82,19 +82,19 @@ def run(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> None:
             continue
         if _progress(folder, batch) == before:
             raise UserError(
-                f"the launcher failed before any job began ({records.first_line(error)}): see "
+                f"the launcher failed before any job started ({records.first_line(error)}): see "
                 f"{folder} or try --launcher basic."
             ) from error
-        print(f"styleexp-sweep: a worker failed ({records.first_line(error)}); going on.")
+        print(f"styleexp-sweep: a worker failed ({records.first_line(error)}); continuing.")
 
 
 def retry(jobs: Sequence[Planned]) -> None:
-    """Let failed jobs run again, from their checkpoints where they have one."""
+    """Mark failed jobs to run again, from their checkpoints if they have one."""
     for job in jobs:
         if runs.of_job(job)["status"] != "failed":
             continue
         with suppress(locks.Busy), locks.hold(job.folder):
-            again = "failed, to be tried again"
+            again = "failed, to be retried"
             records.RunFolder(job.folder).write_status("interrupted", reason=again)
 
 
@@ -112,7 +112,8 @@ def _progress(folder: Path, jobs: Sequence[Planned]) -> list[Any]:
 
 
 def _launch(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> Exception | None:
-    """Give the jobs to Hydra's launcher; returns what it raised or a job's process died of."""
+    """Run the jobs with Hydra's launcher; return the exception that it raised or that killed a
+    job."""
     import hydra
     from hydra._internal.callbacks import Callbacks
     from hydra.core.global_hydra import GlobalHydra
@@ -134,7 +135,7 @@ def _launch(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> E
             config=config,
         )
         threads = launchers.threads_each(config.hydra)
-        # Hydra composes every job with the launcher's own overrides: they need the launcher, too.
+        # Hydra composes every job with the launcher's own overrides, which need the launcher.
         chosen = [each for each in launcher if each.startswith("launcher=")]
         given = []
         for job in jobs:
@@ -156,15 +157,16 @@ def _launch(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> E
 
 
 def _settle(jobs: Sequence[Planned]) -> None:
-    """Wait for the jobs that go on although another of them was killed."""
+    """Wait for jobs that are still running after another one was killed."""
     while any(runs.of_job(job)["status"] == "running" for job in jobs):
         time.sleep(POLL)
 
 
 def task(config: DictConfig) -> None:
-    """What the launcher calls for a job, maybe in another process.
+    """Job function for the launcher, possibly called in another process.
 
-    Skips what another runner does or did in the meantime. Never raises for the job's own failure.
+    Skips jobs that another runner executes or has finished meanwhile. Never raises if the job
+    fails.
     """
     from contextlib import chdir
 
@@ -177,16 +179,16 @@ def task(config: DictConfig) -> None:
     runtime = HydraConfig.get()
     root, folder = Path(runtime.sweep.dir), Path(runtime.runtime.output_dir)
     name = str(runtime.sweep.subdir)
-    # As they are in Hydra's grammar: resolved, an escaped "${" in a file's name would be lost.
+    # Keep Hydra's grammar: resolving would lose an escaped "${" in a file's name.
     given: Any = OmegaConf.to_container(runtime.overrides.task, resolve=False)
     compose.register()
     try:
         with AT_WORK, locks.hold(folder), chdir(runtime.runtime.cwd):  # see hydra.job.chdir
-            # No key: somebody removed the manifest, which the runner then writes anew.
+            # No key: the manifest was removed; the runner rewrites it.
             key = manifest.read(root).get(name, {}).get("key")
             job = Job(name, tuple(given), folder, key)
             state = runs.of_job(job)["status"] if key else runs.status(folder)
-            if state not in (*manifest.ENDED, "other"):  # the runner refuses another run's folder
+            if state not in (*manifest.ENDED, "other"):  # the runner rejects another run's folder
                 _work(config, root, job)
     except locks.Busy:
         return
@@ -194,7 +196,7 @@ def task(config: DictConfig) -> None:
 
 @cache
 def _end_with_runner() -> None:
-    """End a worker of joblib after its job where its runner was killed: it would wait for ever."""
+    """Exit a joblib worker after its job if its runner was killed; it would wait forever."""
     if not multiprocessing.current_process().name.startswith("Loky"):
         return
     runner = os.getppid()
@@ -209,7 +211,7 @@ def _end_with_runner() -> None:
 
 
 def _work(config: DictConfig, root: Path, job: Job) -> None:
-    """Do a job whose lock is held; what it prints goes into its log."""
+    """Run a job whose lock is held, with its output redirected to its log."""
     from styleexp import compose, identity
     from styleexp.cli.run import begin
 
@@ -227,8 +229,8 @@ def _work(config: DictConfig, root: Path, job: Job) -> None:
             typed = compose.typed(config)
             if job.key not in (None, identity.job_key(typed)):
                 raise UserError(
-                    "a file of its source or style has changed since the plan was read: start the "
-                    "plan again."
+                    "its source or style file has changed since the plan was read: start the plan "
+                    "again."
                 )
             code = begin(typed, folder, [*told, "hydra.mode=RUN"])
         except UserError as error:
@@ -248,6 +250,6 @@ def _work(config: DictConfig, root: Path, job: Job) -> None:
 
 
 def _failed(folder: Path, reason: str) -> None:
-    """Leave a status where the run could not even begin one."""
+    """Write a status if the run failed before it could."""
     if runs.status(folder) != "failed":
         records.RunFolder(folder).write_status("failed", reason=reason)

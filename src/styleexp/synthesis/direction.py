@@ -1,4 +1,4 @@
-"""A smooth field of unit tangent directions: which way a pattern's up points on a surface."""
+"""Smooth fields of unit tangent directions, which define a pattern's up on a surface."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ if TYPE_CHECKING:
     from styleexp.synthesis.walk import Sheet
 
 FLOW, UP = 0.08, 0.018
-"""Over which length smoothness counts as much as the wish, in units of the vertices: over a long
-one the field flows along the form; over a short one it holds the wish wherever the surface
-allows it."""
+"""Length, in units of the vertices, at which smoothness and the wished direction have equal weight:
+with a long one the field flows along the form; with a short one it follows the wish wherever the
+surface allows."""
 
 
 def direction_field(
     sheet: Sheet, wish: Float[np.ndarray, "vertices 3"], length: float
 ) -> Float[np.ndarray, "vertices 3"]:
-    """The unit tangent field that turns least from vertex to vertex (connection Laplacian) while it
-    follows ``wish`` where that lies in the surface; ``length`` is `FLOW`, `UP` or another.
+    """Smoothest unit tangent field (connection Laplacian) that follows ``wish`` where it is
+    tangential; ``length`` is `FLOW`, `UP` or any other.
 
-    One sparse complex system. ``wish`` need be neither unit nor tangent; where it stands upright on
-    the surface it has no say.
+    Solves one sparse complex system. ``wish`` needs to be neither unit nor tangent; where it is
+    normal to the surface it has no effect.
     """
     vertices, normals = sheet.vertices, sheet.normals
     x, y = frames(normals)
@@ -45,7 +45,7 @@ def direction_field(
     say = sheet.areas / length**2 * np.linalg.norm(tangent, axis=1) ** 2
     asked = (tangent * x).sum(1) + 1j * (tangent * y).sum(1)
     asked = say * asked / np.abs(asked).clip(min=1e-9)
-    # A component that the wish says nothing of would leave the matrix singular.
+    # A component without a wish would make the matrix singular.
     diagonal = degree + say + 1e-6
     matrix = (laplacian + diags(diagonal)).tocsr()
     field = cg(matrix, asked + 1e-9, rtol=1e-6, M=diags(1 / diagonal))[0]
@@ -56,7 +56,7 @@ def direction_field(
 def frames(
     normals: Float[np.ndarray, "vertices 3"],
 ) -> tuple[Float[np.ndarray, "vertices 3"], Float[np.ndarray, "vertices 3"]]:
-    """Two unit tangents at each vertex, right-handed with the normal."""
+    """Two unit tangents per vertex, right-handed with the normal."""
     reference = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]])
     x = reference - (reference * normals).sum(1, keepdims=True) * normals
     x /= np.linalg.norm(x, axis=1, keepdims=True)
@@ -68,6 +68,6 @@ def turned(
     normals: Float[np.ndarray, "vertices 3"],
     angle: Float[np.ndarray, " vertices"] | float,
 ) -> Float[np.ndarray, "vertices 3"]:
-    """The directions turned about the normals, by an angle in radians, counter-clockwise."""
+    """Rotate directions about the normals by an angle in radians, counter-clockwise."""
     angle = np.broadcast_to(angle, len(ahead))[:, None]
     return np.cos(angle) * ahead + np.sin(angle) * np.cross(normals, ahead)

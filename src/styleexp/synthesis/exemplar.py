@@ -1,7 +1,7 @@
-"""The style as an example of a relief: heights over a smooth shape, or a picture's tone.
+"""Exemplars of a relief: a style mesh's heights above a smooth shape, or an image's tone.
 
-All lengths are in units of the pattern: radii of a style mesh; a picture's are what
-``style.image_tile`` says.
+All lengths are in units of the pattern: radii of a style mesh, or as set by ``style.image_tile``
+for an image.
 """
 
 from __future__ import annotations
@@ -26,70 +26,70 @@ if TYPE_CHECKING:
 Y = (0.0, 1.0, 0.0)
 FLAT_UP = (0.0, 0.0, -1.0)
 LEAST_SEEN = 0.98
-"""Share of a patch that has to lie on the style mesh, not beyond its boundary, and where its relief
-is as usual; or the best `BEST` of all patches do."""
+"""Minimum fraction of a patch that must be on the style mesh and on its usual relief. If too few
+patches qualify, the best fraction `BEST` of all patches is used."""
 BEST = 0.25
 UPRIGHT = 0.35
-"""Sine of the angle between a style mesh's normal and its up below which no patch is taken there:
-round a pole of the direction field patterns turn."""
+"""Sine of the angle between the style mesh's normal and its up direction below which no patch is
+taken, because patterns rotate around poles of the direction field."""
 SPECTRUM = 25
-"""Samples on a side of the patches that the pattern's wavelength is measured on."""
+"""Samples per side of the patches used to measure the wavelength."""
 
 CLEAR = 0.05
-"""A rise of the heights' likeness, in shares of their variance, that is no chance."""
+"""Significant rise of the heights' autocovariance, as a fraction of their variance."""
 
 
 Places: TypeAlias = "Float[np.ndarray, 'places numbers']"
-"""Where patches are taken, a row of numbers each, which only their exemplar understands."""
+"""Positions of patches, one row of numbers each, in a format private to their exemplar."""
 
 
 class Exemplar(Protocol):
-    """Where patches come from."""
+    """A source of patches."""
 
     @property
     def extent(self) -> float:
-        """Length of the whole."""
+        """Length of the whole exemplar."""
         ...
 
     def sample(
         self, count: int, side: int, spacing: float, rng: np.random.Generator, any_way: bool
     ) -> tuple[Float[Tensor, "patches side side"], Places]:
-        """At most ``count`` patches of heights at a spacing, blurred to it, row 0 up, and where
-        they are from. ``any_way`` turns each by an angle of its own."""
+        """Up to ``count`` patches of heights at a spacing, blurred accordingly, row 0 up, and their
+        positions. ``any_way`` rotates each patch randomly."""
         ...
 
     def patches(
         self, places: Places, side: int, spacing: float
     ) -> Float[Tensor, "patches side side"]:
-        """The patches of these places."""
+        """The patches at these positions."""
         ...
 
 
 @dataclass(frozen=True)
 class MeshExemplar:
-    """The relief of a style mesh, sampled by walking over its smooth shape."""
+    """A style mesh's relief, sampled by walking over its smooth shape."""
 
     sheet: Sheet
     """The smooth shape, in the unit sphere."""
     height: Float[np.ndarray, " vertices"]
     usual: Bool[np.ndarray, " vertices"] | None = None
-    """Where the relief is the pattern; None is everywhere. Elsewhere are a rim, a flat base."""
+    """Vertices where the relief is the pattern, not a rim or a flat base; None means all."""
     extent: float = 2.0
 
     @cached_property
     def up(self) -> tuple[float, float, float]:
-        """+Y; of a surface that lies flat, as a terrain does, -Z, as on a map."""
+        """Up direction: +Y; for a flat surface such as a terrain -Z, as on a map."""
         lying = np.linalg.norm(np.cross(self.sheet.normals, Y), axis=1) <= UPRIGHT
         return FLAT_UP if np.average(lying, weights=self._weights) > 0.5 else Y
 
     @cached_property
     def ahead(self) -> Float[np.ndarray, "vertices 3"]:
-        """Which way is up."""
+        """Unit tangent that points up, per vertex."""
         return direction_field(self.sheet, np.broadcast_to(self.up, self.sheet.vertices.shape), UP)
 
     @property
     def frequency(self) -> float:
-        """Root mean square frequency of the relief, in cycles per radius, where it is as usual."""
+        """RMS frequency of the usual relief, in cycles per radius."""
         faces = self.sheet.faces
         if self.usual is not None:
             faces = faces[self.usual[faces].all(axis=1)]
@@ -97,14 +97,14 @@ class MeshExemplar:
 
     @cached_property
     def _weights(self) -> Float[np.ndarray, " vertices"]:
-        """Vertices stand for the area around them: dense parts of a mesh don't count more."""
+        """Area weights of the vertices, so that dense parts of a mesh don't count more."""
         areas = self.sheet.areas
         return areas if self.usual is None else areas * self.usual
 
     def sample(
         self, count: int, side: int, spacing: float, rng: np.random.Generator, any_way: bool
     ) -> tuple[Float[Tensor, "patches side side"], Places]:
-        """See `Exemplar`. A place is a vertex and the unit tangent that is up there."""
+        """See `Exemplar`. A position is a vertex and its up tangent."""
         sheet = self.sheet
         standing = np.linalg.norm(np.cross(sheet.normals, self.up), axis=1)
         allowed = np.flatnonzero((standing > UPRIGHT) | any_way)
@@ -127,7 +127,7 @@ class MeshExemplar:
     def _patches(
         self, places: Places, side: int, spacing: float
     ) -> tuple[Float[Tensor, "patches side side"], Float[np.ndarray, " patches"]]:
-        """Patches, and how much of each lies on the mesh where its relief is as usual."""
+        """Patches, and the fraction of each that is on the mesh's usual relief."""
         sheet = self.sheet
         start = places[:, 0].astype(np.int64)
         points, nears, _ = sheet.grids(start, places[:, 1:], side, spacing)
@@ -144,11 +144,11 @@ class MeshExemplar:
 
 @dataclass(frozen=True)
 class PictureExemplar:
-    """A picture's tone as heights; it is mirrored at its borders."""
+    """An image's tone as heights, mirrored at its borders."""
 
     height: Float[Tensor, "rows columns"]
     pixel: float
-    """Length of a pixel."""
+    """Side length of a pixel."""
 
     @property
     def extent(self) -> float:
@@ -158,7 +158,7 @@ class PictureExemplar:
     def sample(
         self, count: int, side: int, spacing: float, rng: np.random.Generator, any_way: bool
     ) -> tuple[Float[Tensor, "patches side side"], Places]:
-        """See `Exemplar`. A place is a row, a column, and the angle of up, clockwise."""
+        """See `Exemplar`. A position is a row, a column, and the clockwise angle of up."""
         reach = (side // 2) * spacing / self.pixel * (np.sqrt(2) if any_way else 1.0)
         middle = [
             rng.uniform(min(reach, size / 2), max(size - reach, size / 2), count)
@@ -191,20 +191,20 @@ class PictureExemplar:
 
 @dataclass(frozen=True)
 class Pattern:
-    """What an exemplar's patches tell of it."""
+    """Measurements of an exemplar's patches."""
 
     wavelength: float
-    """Twice the distance at which heights first are least alike, in whatever direction."""
+    """Twice the distance of the first minimum of the autocovariance, in any direction."""
     directed: float
-    """How much the likeness of heights at that distance depends on the direction: its deviation
-    over that of the likeness at all distances."""
+    """Anisotropy: standard deviation of the autocovariance over directions at that distance,
+    relative to that over all distances."""
     low: float
     high: float
-    """1st and 99th percentile of the heights."""
+    """``low`` and ``high`` are the 1st and 99th percentiles of the heights."""
 
 
 def measure(exemplar: Exemplar, rng: np.random.Generator) -> Pattern:
-    """Wavelength, direction and height of an exemplar, by the autocovariance of its heights."""
+    """Measure wavelength, direction and height of an exemplar from its autocovariance."""
     for samples in (60, 150, 375):
         spacing = exemplar.extent / samples
         patches, _ = exemplar.sample(1000, SPECTRUM, spacing, rng, any_way=False)
@@ -223,8 +223,8 @@ def measure(exemplar: Exemplar, rng: np.random.Generator) -> Pattern:
 
 
 def _first_trough(along: Float[Tensor, "angles radii"], radii: Float[Tensor, " radii"]) -> float:
-    """The smallest radius at which likeness falls and clearly rises again in some direction; where
-    it never does, as in patterns without any order, where it has fallen to a tenth."""
+    """Smallest radius at which the autocovariance has a clear minimum in some direction; without
+    one, as in unordered patterns, the radius at which it drops to a tenth."""
     least = along[:, 1:-1]
     trough = (least <= along[:, :-2]) & (least < along[:, 2:])
     rise = torch.stack([along[:, at + 1 : at + 9].amax(1) for at in range(1, len(radii) - 1)], 1)
@@ -237,7 +237,7 @@ def _first_trough(along: Float[Tensor, "angles radii"], radii: Float[Tensor, " r
 
 
 def _polar(values: Tensor, radii: Tensor, angles: Tensor) -> Tensor:
-    """A square map at (angles, radii) in pixels from its middle."""
+    """Sample a square map at (angles, radii), in pixels from its centre."""
     half = values.shape[0] // 2
     x = radii[None] * torch.cos(angles)[:, None] / (half + 0.5)
     y = radii[None] * torch.sin(angles)[:, None] / (half + 0.5)

@@ -1,4 +1,4 @@
-"""``method=synthesis``: the style's relief laid on the source by example. See the package."""
+"""``method=synthesis``: synthesise the style's relief on the source; see the package."""
 
 from __future__ import annotations
 
@@ -36,23 +36,23 @@ if TYPE_CHECKING:
     from styleexp.scene import Subject
 
 DIRECTED = 0.25
-"""A `Pattern.directed` above this has a direction."""
+"""A pattern has a direction if its `Pattern.directed` exceeds this."""
 PER_WAVE = 5.4
-"""Samples on a wavelength at the coarsest level. What is larger than a patch of so many samples the
-quilt has decided already; coarser patches would smooth it away."""
+"""Samples per wavelength at the coarsest level. The quilt already determines everything larger than
+a patch at this spacing; coarser patches would smooth it away."""
 COARSEST = 0.06
-"""Longest spacing of a patch's samples, in units of the pattern: larger pieces of the quilt fit on
-few parts of a mesh."""
+"""Maximum sample spacing, in units of the pattern; larger quilt pieces fit on few parts of a
+mesh."""
 ROUNDS = (10, 6, 3)
-"""Of the levels, from coarse to fine."""
+"""Rounds per level, from coarse to fine."""
 EVEN = 1.5
-"""Edges: what is finer is taken off the relief, or steep walls between them would be saws."""
+"""Smoothing length in edges; removes finer relief, which would turn steep walls into sawteeth."""
 ROOM = 0.6
-"""The relief may take up this share of the room inside and outside the surface."""
+"""Maximum fraction of the free space inside and outside the surface that the relief may use."""
 
 
 class Synthesis:
-    """The method: see the module."""
+    """The synthesis method: see the module."""
 
     def __init__(self, config: SynthesisConfig):
         self.config = config
@@ -62,18 +62,18 @@ class Synthesis:
             raise UserError(f"baseline.flatten={config.flatten} is not allowed: give 0 to 1.")
 
     def prepare(self, config: Config) -> Subject:
-        """Source and style; neither renderer nor encoder."""
+        """Load source and style; needs neither renderer nor encoder."""
         return load(config, relief_of(config))
 
     def start(self, scene: Subject) -> None:
-        """There are no steps that a checkpoint could stand between."""
+        """Return None: there are no steps to checkpoint."""
 
     def optimise(self, scene: Subject, state: None) -> Iterator[Step]:
-        """No step."""
+        """Yield nothing: there are no steps."""
         return iter(())
 
     def finish(self, scene: Subject, state: None) -> Result:
-        """Displace the source by the relief; zero on average over the surface."""
+        """Displace the source by the relief, with zero mean over the surface."""
         if scene.smooth:
             still = np.zeros(len(scene.source.vertices))
             return Result(scene, still, scene.source.vertices.copy())
@@ -88,13 +88,13 @@ class Synthesis:
 
 
 def relief_of(config: Config) -> Callable[[meshes.Mesh], MeshExemplar | None]:
-    """What tells a style mesh's relief from its shape: see `scene.load`."""
+    """Function that separates a style mesh's relief from its shape; see `scene.load`."""
     return lambda style: exemplar_of(style, config.style.relief_length)
 
 
 def relief(scene: Subject, config: SynthesisConfig, strength: float) -> Float[Tensor, " vertices"]:
-    """The style's relief on the source's vertices, ``strength`` times as high, in radii of the
-    normalised source; zero on average over the surface."""
+    """The style's relief at the source's vertices, scaled by ``strength``, in radii of the
+    normalised source, with zero mean over the surface."""
     rng = np.random.default_rng(scene.config.optim.seed)
     doing("measuring the style's pattern")
     exemplar = exemplar_of_style(scene)
@@ -111,7 +111,7 @@ def relief(scene: Subject, config: SynthesisConfig, strength: float) -> Float[Te
     for number, height in synthesise(  # noqa: B007  the last is the result
         sheet, ahead, exemplar, levels, scene.unit, not directed, rng, most=config.bank
     ):
-        doing(f"laying the relief, round {number} of {total}")
+        doing(f"synthesising the relief, round {number} of {total}")
     even = smoother(sheet.vertices, sheet.faces, EVEN * sheet.edge)
     height = torch.from_numpy(even(height.numpy()))
     displacement = height * scene.unit * strength
@@ -127,7 +127,7 @@ def relief(scene: Subject, config: SynthesisConfig, strength: float) -> Float[Te
 
 
 def directions(scene: Subject, sheet: Sheet, directed: bool) -> Float[np.ndarray, "vertices 3"]:
-    """Which way the pattern's up points at each vertex: see `config.StyleConfig`."""
+    """Direction of the pattern's up at each vertex; see `config.StyleConfig`."""
     style = scene.config.style
     name = style.direction
     if name.startswith(ATTRIBUTE):
@@ -141,7 +141,7 @@ def directions(scene: Subject, sheet: Sheet, directed: bool) -> Float[np.ndarray
 
 
 def exemplar_of_style(scene: Subject) -> MeshExemplar | PictureExemplar:
-    """The style as an example; a picture's heights are ``scene.relief`` high."""
+    """The style as an exemplar; an image's heights are scaled to ``scene.relief``."""
     if scene.example is not None:
         return scene.example
     tile = height_maps.height_map(scene, height_maps.PATCH)
@@ -150,8 +150,8 @@ def exemplar_of_style(scene: Subject) -> MeshExemplar | PictureExemplar:
 
 
 def levels_of(pattern: Pattern, edge: float) -> list[Level]:
-    """Spacings from the pattern's wavelength down to the mesh's edges (in units of the pattern),
-    halved from level to level."""
+    """Levels with spacings from the pattern's wavelength down to the mesh's edge length (in units
+    of the pattern), halved from level to level."""
     coarsest = min(pattern.wavelength / PER_WAVE, COARSEST)
     spacings = [coarsest / 2**number for number in range(len(ROUNDS))]
     carried = [each for each in spacings[1:] if each >= 0.8 * edge]
@@ -159,7 +159,7 @@ def levels_of(pattern: Pattern, edge: float) -> list[Level]:
 
 
 def told(scene: Subject, pattern: Pattern, directed: bool, levels: list[Level]) -> str:
-    """What was measured of the style, in one line."""
+    """One-line summary of the style's measurements."""
     name = scene.config.style.path or scene.config.style.name
     return (
         f"'{name}': wavelength {pattern.wavelength * scene.unit:.3f} and height "
@@ -169,8 +169,8 @@ def told(scene: Subject, pattern: Pattern, directed: bool, levels: list[Level]) 
 
 
 def fade(sheet: Sheet, height: float) -> Float[np.ndarray, " vertices"]:
-    """A factor on a relief of half range ``height``, below 1 where it would meet the surface's
-    other side, or the next finger's."""
+    """Factor on a relief of half range ``height``; below 1 where it would reach the opposite side
+    of the surface or a neighbouring part."""
     reach = 2 * height / ROOM
     room = np.minimum(ball_radius(sheet, -1, reach), ball_radius(sheet, 1, reach))
     factor = (ROOM * room / max(height, 1e-12)).clip(0, 1)

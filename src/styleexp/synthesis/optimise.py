@@ -1,4 +1,5 @@
-"""Heights on a mesh that look like an exemplar's everywhere: patch by patch, coarse to fine."""
+"""Optimise heights on a mesh to look like an exemplar everywhere: patch by patch, coarse to
+fine."""
 
 from __future__ import annotations
 
@@ -22,31 +23,32 @@ if TYPE_CHECKING:
     from styleexp.synthesis.exemplar import Exemplar
 
 COMPONENTS = 24
-"""Principal components by which patches are compared."""
+"""Number of principal components for comparing patches."""
 SAMPLES = 40_000
-"""Of the exemplar's heights, for their deviation."""
+"""Number of exemplar heights used to estimate their distribution."""
 MOST_GAIN = 1.5
-"""Of the heights, against what blur took of them."""
+"""Maximum factor on the heights to compensate for blur."""
 SIDE = 9
-"""Samples on a patch's side."""
+"""Samples per patch side."""
 FINE_SIDE = 7
-"""The same at the last of several levels, where there is most to do and least to decide."""
+"""Samples per patch side at the finest of several levels, which has the most patches and the fewest
+ambiguities."""
 DENSITY, FINE_DENSITY = 0.8, 1.3
-"""Distance of the patches' middles over their samples' spacing; the second at the last level."""
+"""Distance between patch centres, in sample spacings; the second at the finest level."""
 VOTE = 0.2
-"""Standard deviation of a patch's weights, over its side."""
+"""Standard deviation of a patch's Gaussian weights, relative to its side."""
 KEEP, KEEP_FINE = 4.0, 1.0
-"""The patch that the quilt has at a place is kept while its misfit times this is less than that of
-the best patch of all. The first at the first level, where seams are mended: the quilt fits itself,
-with all its seams."""
+"""The quilt's own patch is kept while its misfit times this factor is below that of the best patch.
+The first applies to the first level, where seams are repaired: the quilt, with its seams, matches
+itself."""
 AT_ONCE = 256
-"""Grids that are compared with the whole bank at once: the distances then fit a cache."""
+"""Grids compared with the whole bank per batch, so that the distances fit a cache."""
 CHOICE = 0.3
-"""Pieces that the quilt chooses from, for each patch of a bank."""
+"""Number of quilt pieces to choose from, per patch of a bank."""
 SIMILAR = 12
-"""Patches like the last best one that a grid is compared with where the whole bank is too slow."""
+"""Number of patches, similar to the previous best one, to compare instead of the whole bank."""
 TRUST = 0.6
-"""A patch's vote counts by its misfit to the power of minus this."""
+"""A patch's vote is weighted by its misfit to the power of minus this."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class Level:
     """One scale of the synthesis."""
 
     spacing: float
-    """Of a patch's samples, in units of the pattern."""
+    """Sample spacing of a patch, in units of the pattern."""
     rounds: int
 
 
@@ -65,28 +67,28 @@ class Bank:
     patches: Float[Tensor, "patches cells"]
     mean: Float[Tensor, " cells"]
     basis: Float[Tensor, "cells components"]
-    """Takes a patch less the mean to what is compared, its middle counting more than its rim."""
+    """Maps a mean-free patch to its comparison features; the centre counts more than the rim."""
     reduced: Float[Tensor, "patches components"]
 
     @property
     def middles(self) -> Float[Tensor, " patches"]:
-        """Heights in the middle of the patches."""
+        """Heights at the patch centres."""
         return self.patches[:, self.patches.shape[1] // 2]
 
     def nearest(self, grids: Float[Tensor, "grids cells"]) -> tuple[Tensor, Tensor]:
-        """For each grid the most similar patch, and the squared distance to it."""
+        """For each grid, the most similar patch and the squared distance to it."""
         best, least = self._search(self.compared(grids), 1)
         return best[:, 0], least[:, 0]
 
     def compared(self, patches: Float[Tensor, "... cells"]) -> Float[Tensor, "... components"]:
-        """What of patches is compared."""
+        """Comparison features of patches."""
         return (patches - self.mean) @ self.basis
 
     def nearer(
         self, grids: Float[Tensor, "grids cells"], before: Int[Tensor, " grids"]
     ) -> tuple[Tensor, Tensor]:
-        """The same among the patches like the one found ``before``: a round changes a grid little,
-        and this takes a tenth of the time."""
+        """Like `nearest`, among the patches similar to that found ``before``. A round changes a
+        grid little, and this takes a tenth of the time."""
         reduced = self.compared(grids)
         best, least = [], []
         for at in range(0, len(grids), 16 * AT_ONCE):
@@ -99,19 +101,19 @@ class Bank:
 
     @cached_property
     def similar(self) -> Int[Tensor, "patches similar"]:
-        """For each patch those most like it, itself among them."""
+        """For each patch, the most similar ones, including itself."""
         return self._search(self.reduced, min(SIMILAR, len(self.reduced)))[0]
 
     def _search(
         self, reduced: Float[Tensor, "grids components"], count: int
     ) -> tuple[Int[Tensor, "grids count"], Float[Tensor, "grids count"]]:
-        """The ``count`` patches nearest to each, and the squared distances."""
+        """The ``count`` nearest patches for each query, and the squared distances."""
         own = self.reduced.square().sum(1)
         best, least = [], []
         for at in range(0, len(reduced), AT_ONCE):
             some = reduced[at : at + AT_ONCE]
             away = torch.addmm(own[None], some, self.reduced.T, alpha=-2)
-            # The least alone is found ten times as fast as the least few.
+            # A minimum is ten times as fast as the smallest few.
             found = away.min(1, True) if count == 1 else away.topk(count, 1, largest=False)
             best.append(found.indices)
             least.append((found.values + some.square().sum(1, keepdim=True)).clamp(min=0))
@@ -119,7 +121,7 @@ class Bank:
 
 
 def bank(patches: Float[Tensor, "patches side side"]) -> Bank:
-    """A bank of these patches."""
+    """Build a bank from patches."""
     side = patches.shape[1]
     flat = patches.flatten(1)
     mean = flat.mean(0)
@@ -141,10 +143,11 @@ def synthesise(
     rng: np.random.Generator,
     most: int = 10_000,
 ) -> Iterator[tuple[int, Float[Tensor, " vertices"]]]:
-    """Heights of the vertices, in units of the pattern, after every round, with its number from 1.
+    """Yield the vertices' heights, in units of the pattern, after every round, with its 1-based
+    number.
 
-    ``ahead`` is which way the pattern's up points, ``unit`` the length of such a unit on the mesh,
-    ``most`` the size of a level's bank.
+    ``ahead`` is the direction of the pattern's up, ``unit`` the length of a pattern unit on the
+    mesh, ``most`` the maximum size of a level's bank.
     """
     doing("covering the source with pieces of the style")
     first, last = levels[0], levels[-1]
@@ -179,8 +182,8 @@ def synthesise(
             height = matched(height, known.middles)
             done += 1
             yield done, height
-    # A vote is a mean, which takes of the depth. (The exemplar's own distribution, unblurred, would
-    # broaden its ridges: a mesh can't hold slopes as steep.)
+    # Averaging votes reduces the depth. (Matching the exemplar's unblurred distribution would
+    # broaden its ridges, because a mesh can't represent slopes that steep.)
     own_heights = exemplar.sample(SAMPLES, 1, 1e-6, rng, any_way)[0]
     gain = float(own_heights.std() / height.std().clamp(min=1e-12))
     yield done, height.mean() + min(gain, MOST_GAIN) * (height - height.mean())
@@ -189,8 +192,8 @@ def synthesise(
 def matched(
     height: Float[Tensor, " vertices"], like: Float[Tensor, " samples"]
 ) -> Float[Tensor, " vertices"]:
-    """The heights in their order, with the distribution of others: averaging would flatten them,
-    and the patch nearest to flat ones is flatter still."""
+    """Histogram matching: keep the order of the heights, with another distribution. Averaging would
+    flatten them, and the patches nearest to flat ones are flatter still."""
     quantiles = torch.quantile(like[:100_000], torch.linspace(0, 1, 512))
     place = torch.empty_like(height)
     place[height.argsort()] = torch.linspace(0, 511, len(height))
@@ -203,6 +206,7 @@ def _apply(matrix: csr_matrix, values: Tensor) -> Tensor:
 
 
 def _gaussian(side: int, width: float) -> Float[Tensor, " cells"]:
-    """Weights of a patch's cells; ``width`` is the standard deviation over the side."""
+    """Gaussian weights of a patch's cells; ``width`` is the standard deviation relative to the
+    side."""
     line = torch.exp(-0.5 * ((torch.arange(side) - side // 2) / (width * side)) ** 2)
     return (line[:, None] * line[None]).flatten()

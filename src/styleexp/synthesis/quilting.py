@@ -1,4 +1,4 @@
-"""Where the synthesis starts: large pieces of the exemplar, laid side by side on the mesh."""
+"""Initialise the synthesis with a quilt: large pieces of the exemplar, side by side on the mesh."""
 
 from __future__ import annotations
 
@@ -20,37 +20,37 @@ if TYPE_CHECKING:
     from styleexp.synthesis.walk import Sheet
 
 SIDE = 25
-"""Samples on a piece's side."""
+"""Samples per piece side."""
 APART = 0.45
-"""Distance of pieces on the mesh, in their sides; less where a first round left gaps."""
+"""Distance between pieces on the mesh, in piece sides; smaller where a first round left gaps."""
 SAME_WAY = 0.2
-"""Cosine between normals below which a part of the mesh is another side than the piece's: a piece
-ends where a limb turns away from it."""
+"""Cosine between normals below which a vertex faces away from a piece: a piece ends where a limb
+turns away from it."""
 MARGIN = 6
-"""Samples round a piece that patches at its rim reach."""
+"""Margin of samples around a piece, for patches at its rim."""
 MOST_SAMPLES = 3_000_000
-"""Of all pieces together."""
+"""Maximum number of samples of all pieces together."""
 LABELS = 2
-"""Pieces that a vertex may lie in."""
+"""Maximum number of pieces per vertex."""
 
 
 @dataclass(frozen=True)
 class Quilt:
-    """Where each vertex lies on the exemplar."""
+    """Position of each vertex on the exemplar."""
 
     pieces: Float[Tensor, "pieces samples samples"]
     spacing: float
-    """Of the pieces' samples, in units of the pattern."""
+    """Sample spacing of the pieces, in units of the pattern."""
     piece: Int[Tensor, "vertices labels"]
     place: Float[Tensor, "vertices labels 2"]
-    """Down and right from the piece's middle, in units of the pattern."""
+    """Offset down and right from the piece's centre, in units of the pattern."""
     turn: Float[Tensor, "vertices labels 2"]
-    """Cosine and sine of the angle from the piece's up to the vertex's own, clockwise."""
+    """Cosine and sine of the clockwise angle from the piece's up to the vertex's."""
 
     def patches(
         self, vertices: Int[Tensor, " some"], side: int, spacing: float
     ) -> Float[Tensor, "some labels cells"]:
-        """The exemplar round these vertices, in their own frames, for each of their labels."""
+        """The exemplar around these vertices, in their own frames, for each of their labels."""
         pieces = self.pieces
         if spacing > self.spacing:
             pieces = blurred(pieces, 0.45 * spacing / self.spacing)
@@ -77,12 +77,12 @@ def quilt(
     rng: np.random.Generator,
     choice: int,
 ) -> Quilt:
-    """Cover the mesh by pieces of the exemplar, each the one that agrees best with what lies there
-    already (after Efros and Freeman 2001; Praun et al. 2000).
+    """Cover the mesh with pieces of the exemplar, each chosen to match those already placed (after
+    Efros and Freeman 2001; Praun et al. 2000).
 
-    What is larger than a patch of the synthesis, as a brick or how rows are offset, the synthesis
-    can only keep, not find. ``spacing`` is that of the samples by which pieces are compared, and
-    ``finest`` of those that are kept. ``choice`` pieces are tried at each place.
+    The synthesis can preserve, but not find, structures larger than its patches, such as bricks or
+    the offset of rows. ``spacing`` is the sample spacing for comparing pieces, ``finest`` that of
+    the stored pieces. ``choice`` pieces are tried at each position.
     """
     known, places = exemplar.sample(choice, SIDE, spacing, rng, any_way)
     pieces = known.flatten(1).numpy()
@@ -145,8 +145,8 @@ def _grids(
     piece: Int[np.ndarray, "vertices labels"],
     rng: np.random.Generator,
 ) -> Iterator[tuple[int, tuple[np.ndarray, np.ndarray, np.ndarray]]]:
-    """Where pieces go, with the points of their grids: everywhere, then where ``piece`` has gaps,
-    as behind the bends of a limb."""
+    """Positions of pieces and their grid points: everywhere, then where ``piece`` has gaps, such as
+    behind the bends of a limb."""
     apart = APART * SIDE * step
     for _ in range(3):
         bare = np.flatnonzero(piece[:, 0] < 0)
@@ -165,7 +165,8 @@ def _grids(
 
 
 def _completed(sheet: Sheet, piece: np.ndarray, place: np.ndarray, turn: np.ndarray) -> None:
-    """Give vertices without a label that of the nearest one with one, and a second to all."""
+    """Give unlabelled vertices the label of the nearest labelled one, and every vertex a second
+    label."""
     known = np.flatnonzero(piece[:, 0] >= 0)
     bare = np.flatnonzero(piece[:, 0] < 0)
     if len(bare):
@@ -178,7 +179,7 @@ def _completed(sheet: Sheet, piece: np.ndarray, place: np.ndarray, turn: np.ndar
 
 
 def _spread(points: Float[np.ndarray, "points 3"], distance: float) -> Int[np.ndarray, " places"]:
-    """Points at least that far apart, the farthest first."""
+    """Select points at least ``distance`` apart, by farthest-point sampling."""
     chosen = [0]
     away = np.linalg.norm(points - points[0], axis=1)
     while away.max() > distance:
@@ -188,7 +189,7 @@ def _spread(points: Float[np.ndarray, "points 3"], distance: float) -> Int[np.nd
 
 
 def _outwards(places: Float[np.ndarray, "places 3"]) -> list[int]:
-    """An order in which each place is the nearest one to those before it."""
+    """Order in which each position is the nearest to those before it."""
     order: list[int] = []
     away = np.zeros(len(places))
     for _ in places:
@@ -205,7 +206,7 @@ def _bilinear(
     y: Float[Tensor, "some labels cells"],
     x: Float[Tensor, "some labels cells"],
 ) -> Float[Tensor, "some labels cells"]:
-    """Pieces at samples down and right of their middles; at their rims what lies there."""
+    """Sample pieces at offsets down and right of their centres, clamped at their rims."""
     samples = pieces.shape[1]
     y, x = ((each + samples // 2).clamp(0, samples - 1.001) for each in (y, x))
     row, column = y.long(), x.long()

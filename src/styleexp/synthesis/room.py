@@ -1,4 +1,4 @@
-"""How far a surface can be moved before it meets itself."""
+"""Free space around a surface, before it would meet itself."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ if TYPE_CHECKING:
 
 
 def ball_radius(sheet: Sheet, side: float, largest: float) -> Float[np.ndarray, " vertices"]:
-    """Radius of the largest ball that touches each vertex and holds no other, at most ``largest``.
+    """Radius of the largest ball that touches each vertex and contains no other, up to ``largest``.
 
-    ``side`` -1 is inside the surface (half the thickness there), 1 outside (half the gap). By the
+    ``side`` -1 is inside the surface (half the thickness), 1 outside (half the gap). Uses the
     shrinking ball algorithm (Ma, Bae and Choi 2012).
     """
     points, normals = sheet.vertices, side * sheet.normals

@@ -1,4 +1,4 @@
-"""Any style mesh told apart into a smooth shape and a relief on it."""
+"""Decompose a style mesh into a smooth shape and a relief."""
 
 from __future__ import annotations
 
@@ -25,35 +25,39 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 LENGTHS = (0.5, 0.25, 0.125, 0.0625)
-"""Radii: what is smaller belongs to the relief, where a surface is smoothed along itself; the
-longest that parts them is taken, see `_along_itself`. All but the last are tried."""
+"""Candidate lengths, in radii, below which features are relief when smoothing along the surface.
+The longest that separates shape and relief is used, see `_along_itself`. The last is never tried
+itself."""
 SMOOTH = 0.35
-"""Heights over a surface smoothed half as far, in those over one smoothed as far: of a relief finer
-than both they are the same, of a shape that only bends a quarter. Below this there is no relief."""
+"""Minimum ratio of heights above a surface smoothed half as far to those above the fully smoothed
+one. It is 1 for a relief finer than both, and 1/4 for a shape that only bends. Below this there is
+no relief."""
 FLAT = 1e-4
-"""Deviation of heights, in radii, that is no relief."""
+"""Standard deviation of heights, in radii, below which there is no relief."""
 BLUR = 0.24
-"""Where shape and relief are told apart on a grid it is blurred by this share of the length."""
+"""Blur of the grid that separates shape and relief, as a fraction of the length."""
 CELLS = 112
-"""Of that grid, along the longest side."""
+"""Grid cells along the longest side."""
 REACHES = (0.0, 0.15, 0.3, 0.6)
-"""Radii: gaps in the outside up to twice as wide are closed; the least that leaves few handles."""
+"""Candidate radii for closing gaps of up to twice that width; the smallest that leaves few handles
+is used."""
 MOST_HANDLES = 2
-"""With more of them a mesh is a lattice, whose struts no smoothing along the surface flattens."""
+"""Number of handles above which a mesh is a lattice, whose struts can't be flattened by smoothing
+along the surface."""
 COARSE = 0.04
-"""A style with longer edges on average, in radii, is refined, as patches are taken at vertices; of
-others edges two and a half times as long."""
+"""Mean edge length, in radii, above which the whole style is refined, because patches are taken at
+vertices; in other styles, only edges longer than two and a half times this are."""
 USUAL = (0.25, 2.0)
-"""Mean square slope of the heights around a vertex, in shares of what a quarter of the surface
-exceeds, for it to be of the pattern: less is a flat base or a bare face, more a rim or an ear."""
+"""Range of the mean square slope around a vertex that counts as the pattern, relative to the upper
+quartile: below it is a flat base or a bare face, above it a rim or an ear."""
 
 
 def exemplar_of(mesh: meshes.Mesh, length: float | None = None) -> MeshExemplar | None:
-    """The relief of a style mesh; None where it has none. ``length``, in radii, parts relief and
-    shape (``style.relief_length``); None finds it.
+    """The relief of a style mesh, or None. ``length``, in radii, separates relief and shape
+    (``style.relief_length``); None: estimated.
 
-    One surface without many handles is smoothed along itself. Many components, inner faces, struts:
-    the outside of the whole counts, as seen on a grid.
+    A single surface with few handles is smoothed along itself. With many components, inner faces or
+    struts, the outer surface is extracted on a grid.
     """
     unit = meshes.normalisation(mesh.vertices).apply(mesh.vertices)
     mesh = _seen(meshes.Mesh(mesh.name, unit, mesh.faces))
@@ -63,10 +67,10 @@ def exemplar_of(mesh: meshes.Mesh, length: float | None = None) -> MeshExemplar 
 
 
 def _along_itself(mesh: meshes.Mesh, length: float | None) -> MeshExemplar | None:
-    """The surface smoothed by one implicit step of heat flow, and the height over it.
+    """Smooth the surface by one implicit step of heat flow, and measure the height above it.
 
-    Of several lengths the one with the least change of the heights to half of it: the energy of a
-    relief has a plateau there, that of a bend grows with the square.
+    Chooses the length at which the heights change least when it is halved: a relief's energy has a
+    plateau there, whereas a bend's grows with the square.
     """
     coarse = meshes.mean_edge_length(mesh.vertices, mesh.faces) > COARSE
     mesh = meshes.refine(mesh, COARSE if coarse else 2.5 * COARSE)
@@ -81,16 +85,16 @@ def _along_itself(mesh: meshes.Mesh, length: float | None) -> MeshExemplar | Non
 
 
 def _smoothed(mesh: meshes.Mesh, length: float) -> tuple[Sheet, Float[np.ndarray, " vertices"]]:
-    """The cotangent Laplacian, and not the graph's, as an uneven mesh of a smooth ball has no
-    relief."""
+    """Smooth with the cotangent Laplacian, not the graph Laplacian, so that a non-uniform mesh of a
+    smooth ball has no relief."""
     import gpytoolbox
 
     vertices = mesh.vertices
     laplacian = gpytoolbox.cotangent_laplacian(vertices, mesh.faces)
-    laplacian.data = np.nan_to_num(laplacian.data, posinf=0.0, neginf=0.0)  # of flat faces
+    laplacian.data = np.nan_to_num(laplacian.data, posinf=0.0, neginf=0.0)  # from zero-area faces
     area = Sheet(vertices, mesh.faces).areas
     mass = area.clip(min=1e-9 * area.mean())
-    # A wave of this length is damped to a fifth, as by `relief.smoother`.
+    # Damps a wave of this length to a fifth, like `relief.smoother`.
     time = 4 * (length / (2 * np.pi)) ** 2
     matrix = (diags(mass) + time * laplacian).tocsr()
     inverse = diags(1 / matrix.diagonal())
@@ -98,14 +102,15 @@ def _smoothed(mesh: meshes.Mesh, length: float) -> tuple[Sheet, Float[np.ndarray
     base = np.stack(columns, axis=1)
     normals = meshes.vertex_normals(base, mesh.faces)
     height = ((vertices - base) * normals).sum(axis=1)
-    # Smoothing draws vertices sideways, too, off steep walls: each height belongs below its vertex.
+    # Smoothing also moves vertices sideways, off steep walls; the height must stay below its
+    # vertex.
     base = vertices - height[:, None] * normals
     return Sheet(base, mesh.faces, normals), height - height.mean()
 
 
 def _exemplar(sheet: Sheet, height: Float[np.ndarray, " vertices"], length: float) -> MeshExemplar:
-    """With the parts where the heights are as usual told from those where they are not."""
-    # As wide as a panel between struts, which is of the pattern.
+    """Make an exemplar, with the vertices of usual relief marked."""
+    # As wide as a panel between struts, which belongs to the pattern.
     around = smoother(sheet.vertices, sheet.faces, 0.7 * length)
     energy = around(_steepness(sheet, height))
     order = energy.argsort()
@@ -118,15 +123,15 @@ def _exemplar(sheet: Sheet, height: Float[np.ndarray, " vertices"], length: floa
 def _steepness(
     sheet: Sheet, height: Float[np.ndarray, " vertices"]
 ) -> Float[np.ndarray, " vertices"]:
-    """Mean square slope of the faces round each vertex: by the normals of the surface itself."""
+    """Mean square slope of the faces around each vertex, from the surface's own normals."""
     raised = sheet.vertices + height[:, None] * sheet.normals
     normals = meshes.vertex_normals(raised, sheet.faces)
     return ((normals - sheet.normals) ** 2).sum(axis=1)
 
 
 def _parts(mesh: meshes.Mesh) -> list[np.ndarray]:
-    """The faces of each surface that hangs together, the largest first, those with less than a
-    thousandth of the faces left out."""
+    """Faces of each connected component, largest first, without those with less than a thousandth
+    of the faces."""
     count = len(mesh.vertices)
     a, b = mesh.faces[:, :2].T, mesh.faces[:, 1:].T
     rows, columns = np.concatenate([a[0], b[0]]), np.concatenate([a[1], b[1]])
@@ -143,7 +148,7 @@ def _parts(mesh: meshes.Mesh) -> list[np.ndarray]:
 
 
 def _seen(mesh: meshes.Mesh) -> meshes.Mesh:
-    """Without the components that lie inside the largest one, such as the inner side of a shell."""
+    """Remove components inside the largest one, such as the inner side of a shell."""
     import gpytoolbox
 
     parts = _parts(mesh)
@@ -159,15 +164,16 @@ def _seen(mesh: meshes.Mesh) -> meshes.Mesh:
 
 
 def _handles(faces: Int[np.ndarray, "faces 3"]) -> float:
-    """Genus of a closed surface; of an open one less."""
+    """Genus of a closed surface; a lower value for an open one."""
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     count = len(np.unique(edges, axis=0))
     return 1 - (len(np.unique(faces)) - count + len(faces)) / 2
 
 
 def _outside(mesh: meshes.Mesh, length: float) -> MeshExemplar | None:
-    """Shape and relief by the winding number on a grid: blurred, its half level is the shape; the
-    outermost crossing of the sharp one, along the shape's normals, is the height."""
+    """Shape and relief from the winding number on a grid: the half level of the blurred grid is the
+    shape, and the outermost crossing of the sharp grid, along the shape's normals, is the
+    height."""
     import gpytoolbox
 
     vertices, blur = mesh.vertices, BLUR * length
@@ -183,7 +189,7 @@ def _outside(mesh: meshes.Mesh, length: float) -> MeshExemplar | None:
         np.stack([each.ravel() for each in some], axis=1), vertices, mesh.faces
     )
     full[*inner] = np.clip(wound, 0, 1).reshape(some[0].shape)
-    # In the order that `marching_cubes` wants: x fastest.
+    # In the order of `marching_cubes`: x varies fastest.
     x, y, z = np.meshgrid(*axes, indexing="ij")
     points = np.stack([each.ravel(order="F") for each in (x, y, z)], axis=1)
     for reach in REACHES:
@@ -198,8 +204,8 @@ def _outside(mesh: meshes.Mesh, length: float) -> MeshExemplar | None:
             break
     else:
         raise UserError(
-            f"the style '{mesh.name}' has no outside that a relief could lie on, it is all holes: "
-            "give one with smaller holes."
+            f"the style '{mesh.name}' consists mostly of holes and has no outer surface to take a "
+            "relief from: give one with smaller holes."
         )
     places = ((base - low) / cell).T
     slope = np.stack([map_coordinates(each, places, order=1) for each in np.gradient(soft)], axis=1)
@@ -213,7 +219,7 @@ def _outside(mesh: meshes.Mesh, length: float) -> MeshExemplar | None:
 
 
 def _closed(full: Float[np.ndarray, "x y z"], reach: float) -> Float[np.ndarray, "x y z"]:
-    """Where a ball of this radius, in cells, can't get from outside without touching the full."""
+    """Morphological closing by a ball of this radius, in cells."""
     if reach == 0:
         return full
     near = binary_fill_holes(distance_transform_edt(full < 0.5) <= reach)
@@ -226,8 +232,8 @@ def _outermost(
     outward: Float[np.ndarray, "vertices 3"],
     reach: float,
 ) -> Float[np.ndarray, " vertices"]:
-    """How far along ``outward``, at most ``reach`` either way, the grid is last half full; where it
-    is nowhere, as in a hole through it, the least that it is elsewhere. In cells."""
+    """Position along ``outward``, within ``reach`` either way, of the outermost half-full point, in
+    cells; if there is none, as in a through hole, the minimum over all other points."""
     height = np.full(places.shape[1], -reach)
     found = np.zeros(len(height), dtype=bool)
     steps = np.linspace(reach, -reach, 81)

@@ -1,4 +1,4 @@
-"""Walking over a triangle mesh: where one gets to, and what a function of the vertices is there."""
+"""Walk over a triangle mesh, and interpolate vertex values at the points reached."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 AT_ONCE = 16_000
-"""Points interpolated at once: what they need then fits a cache."""
+"""Points interpolated per batch, so that intermediates fit a cache."""
 THREADED = 10_000
-"""Points from which on they are looked up on all cores."""
+"""Minimum number of points for multi-threaded lookup."""
 GRIDS = 20_000
-"""Grids that are walked at once: what they need is a part of what they become."""
+"""Grids walked per batch, so that intermediates are smaller than the result."""
 MOST_FACES = 24
-"""Faces round a vertex that are looked at; a vertex with more of them is a pole of a fan."""
+"""Maximum number of faces considered around a vertex; vertices with more are poles of fans."""
 
 
 class Sheet:
@@ -42,8 +42,8 @@ class Sheet:
         self.tree = cKDTree(self.vertices)
 
     def nearest(self, points: Float[np.ndarray, "points 3"]) -> Int[np.ndarray, " points"]:
-        """The vertex nearest to each point."""
-        # Threads cost more than they save on few points.
+        """Index of the vertex nearest to each point."""
+        # For few points, threads cost more than they save.
         return self.tree.query(points, workers=-1 if len(points) > THREADED else 1)[1]
 
     def step(
@@ -53,9 +53,9 @@ class Sheet:
         near: Int[np.ndarray, " points"],
         along: tuple[float, float],
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """A step of (forward, to the right) lengths from points on the mesh with unit directions
-        ``ahead`` in it; back on the mesh by the plane of the nearest vertex, the direction carried
-        along. Returns points, directions and nearest vertices."""
+        """Step by lengths (forward, right) from points on the mesh with unit tangents ``ahead``,
+        project onto the tangent plane of the nearest vertex, and transport the direction. Returns
+        points, directions and nearest vertices."""
         aside = np.cross(ahead, self.normals[near])
         moved = points + along[0] * ahead + along[1] * aside
         near = self.nearest(moved)
@@ -76,9 +76,9 @@ class Sheet:
         Int[np.ndarray, "grids side side"],
         Float[np.ndarray, "grids side side 3"],
     ]:
-        """Points of a grid of ``side`` x ``side`` (odd) round each start vertex, walked over the
-        mesh: first along ``ahead``, then to both sides; row 0 lies ahead, column 0 to the left.
-        With them the vertices nearest to them, and ``ahead`` as carried along."""
+        """Points of a ``side`` x ``side`` grid (odd) around each start vertex, walked over the
+        mesh: first along ``ahead``, then to both sides; row 0 is ahead, column 0 left. Also returns
+        the nearest vertices and the transported ``ahead``."""
         count, half = len(start), side // 2
         points, carried = (np.empty((count, side, side, 3)) for _ in range(2))
         nears = np.empty((count, side, side), dtype=np.int64)
@@ -89,7 +89,7 @@ class Sheet:
             for row in range(half - sign, -1 if sign > 0 else side, -sign):
                 at, up, near = self.step(at, up, near, (sign * spacing, 0.0))
                 points[:, row, half], carried[:, row, half], nears[:, row, half] = at, up, near
-        # All rows at once: a step costs little more for many points than for few.
+        # All rows at once: a step costs little more for many points.
         rows = count, side
         for sign in (1, -1):
             at, up = points[:, :, half].reshape(-1, 3), carried[:, :, half].reshape(-1, 3)
@@ -108,7 +108,8 @@ class Sheet:
         side: int,
         spacing: float,
     ) -> csr_matrix:
-        """The matrix, (grids x cells, vertices), that samples values of the vertices by `grids`."""
+        """Sparse matrix, (grids x cells, vertices), that samples vertex values at the points of
+        `grids`."""
         parts = []
         for some in np.array_split(np.arange(len(start)), len(start) // GRIDS + 1):
             points, nears, _ = self.grids(start[some], ahead[some], side, spacing)
@@ -118,12 +119,12 @@ class Sheet:
     def on_the_mesh(
         self, points: Float[np.ndarray, "... 3"], nears: Int[np.ndarray, ...]
     ) -> Bool[np.ndarray, ...]:
-        """Whether points, each with its nearest vertex, are not beyond the mesh's boundary."""
+        """Whether points, given with their nearest vertices, are within the mesh's boundary."""
         away = np.linalg.norm(points - self.vertices[nears], axis=-1)
         return away < 1.5 * self._reach[nears]
 
     def spread(self, distance: float, rng: np.random.Generator) -> Int[np.ndarray, " chosen"]:
-        """Some vertices, evenly spread, about that far apart: one of each cell of a grid."""
+        """Evenly spread vertices, about ``distance`` apart: one per grid cell."""
         order = rng.permutation(len(self.vertices))
         cells = np.floor(self.vertices[order] / distance).astype(np.int64)
         cells -= cells.min(axis=0)
@@ -133,13 +134,13 @@ class Sheet:
 
     @cached_property
     def areas(self) -> Float[np.ndarray, " vertices"]:
-        """A third of the area of the faces round each vertex."""
+        """A third of the area of the adjacent faces, per vertex."""
         third = meshes.face_areas(self.vertices, self.faces) / 3
         return np.bincount(self.faces.ravel(), np.repeat(third, 3), minlength=len(self.vertices))
 
     @cached_property
     def _reach(self) -> Float[np.ndarray, " vertices"]:
-        """Length of the longest edge at each vertex."""
+        """Longest edge length at each vertex."""
         longest = np.zeros(len(self.vertices))
         for a, b in ((0, 1), (1, 2), (2, 0)):
             ends = self.faces[:, a], self.faces[:, b]
@@ -150,9 +151,9 @@ class Sheet:
 
     @cached_property
     def _fans(self) -> tuple[Tensor, Tensor, Int[np.ndarray, " vertices"]]:
-        """For each vertex the other two corners of the faces round it, (vertices, most, 2), what
-        gives a point's coordinates along the two edges, (vertices, most, 2, 3), and how many faces
-        there are."""
+        """For each vertex, the other two corners of its faces, (vertices, most, 2), the dual basis
+        that gives a point's coordinates along the two edges, (vertices, most, 2, 3), and the number
+        of faces."""
         count = len(self.vertices)
         corner = self.faces.ravel()
         order = np.argsort(corner, kind="stable")
@@ -175,12 +176,13 @@ class Sheet:
     def interpolation(
         self, points: Float[np.ndarray, "points 3"], nears: Int[np.ndarray, " points"]
     ) -> csr_matrix:
-        """The matrix, (points, vertices), that interpolates values of the vertices at the points:
-        linear on that face round the nearest vertex which a point lies in or nearest to."""
+        """Sparse matrix, (points, vertices), that interpolates vertex values at points: linearly on
+        the face, among those around the nearest vertex, that contains the point or is nearest to
+        it."""
         others, solve, valence = self._fans
         column = torch.empty(len(points), 3, dtype=torch.int64)
         weight = torch.empty(len(points), 3)
-        # Few vertices have many faces, which all others would have to wait for.
+        # Few vertices have many faces; process them separately.
         least = 0
         for most in (6, 8, others.shape[1]):
             rows = np.flatnonzero((valence[nears] > least) & (valence[nears] <= most))
@@ -191,7 +193,7 @@ class Sheet:
                 fan = others[near, :most]
                 two = torch.einsum("pfad,pd->pfa", solve[near, :most], offset)
                 inside = torch.minimum(two.amin(2), 1 - two.sum(2))
-                # A place without a face has no edges, so its coordinates are zero.
+                # Padding entries have no edges, so their coordinates are zero.
                 inside = torch.where(fan[:, :, 0] == near[:, None], -torch.inf, inside)
                 best, at = inside.argmax(1), torch.arange(len(near))
                 share = two[at, best].clamp(0, 1)

@@ -1,16 +1,15 @@
-"""Anti-aliased outlines, which carry the gradient of visibility.
+"""Anti-aliased outlines with visibility gradients.
 
-An outline is made of contour edges: those of a front face whose neighbour across the edge faces
-away or does not exist. Take such an edge between the centres of two neighbouring pixels, at a
-distance ``s`` (in pixels) from the one on its inside: the outer pixel is given the inner one's
-colour by the part ``s - 0.5`` or, where that is negative, the inner pixel the outer one's by
-``0.5 - s``. The sum over the two moves with ``s`` by their difference in colour, which is the
-derivative of what an area-averaging camera sees.
+An outline consists of contour edges: edges of a front face whose neighbour faces away or doesn't
+exist. Consider such an edge between two neighbouring pixel centres, at a distance ``s`` (in pixels)
+from the inner one. If ``s > 0.5``, the outer pixel is blended with the inner colour by ``s - 0.5``;
+otherwise the inner pixel is blended with the outer colour by ``0.5 - s``. The derivative of the two
+pixels' sum by ``s`` is their difference in colour, as for an area-averaging camera.
 
-Searching edges rather than the visible triangles' neighbours matters: with faces smaller than
-pixels the triangle seen at a pixel centre hardly ever owns the outline next to it. Where several
-edges pass between the same two pixels only the outermost counts. Of the pairs of pixels in rows,
-and in columns, that an edge separates one kind is enough: rows for a steep edge, or else columns.
+All contour edges are searched, not only those of visible triangles: if faces are smaller than
+pixels, the triangle visible at a pixel centre rarely owns the outline next to it. If several edges
+pass between two pixels, only the outermost counts. For each edge, only pixel pairs in rows (for
+steep edges) or only pairs in columns are used.
 """
 
 from __future__ import annotations
@@ -30,15 +29,16 @@ if TYPE_CHECKING:
 
 
 MOST_CROSSINGS = 1 << 20
-"""Crossings held before only the outermost between each two pixels are kept: bounds memory."""
+"""Number of crossings above which all but the outermost per pixel pair are dropped: bounds
+memory."""
 
 
 @dataclass(frozen=True)
 class Crossings:
-    """Outline edges between two neighbouring pixels, n of them."""
+    """n outline edges, each between two neighbouring pixels."""
 
     inner: Int[Tensor, " n"]
-    """Index of the pixel on the inside of the edge, into the flattened (views, height, width)."""
+    """Index of the pixel inside the edge, into the flattened (views, height, width)."""
     outer: Int[Tensor, " n"]
     start: Int[Tensor, " n"]
     """Index of the edge's first vertex into the flattened (views, vertices)."""
@@ -46,21 +46,22 @@ class Crossings:
     center: Float[Tensor, "2 n"]
     """Centre of the inner pixel (column, row)."""
     along_row: Bool[Tensor, " n"]
-    """Whether the two pixels are neighbours in a row (or else in a column)."""
+    """Whether the two pixels are neighbours in a row; otherwise, in a column."""
     direction: Float[Tensor, " n"]
-    """+1 where the outer pixel is to the right or below, -1 where to the left or above."""
+    """+1 if the outer pixel is to the right or below, -1 if to the left or above."""
     view: Int[Tensor, " n"]
     face: Int[Tensor, " n"]
-    """The front face whose edge it is."""
+    """The front face that owns the edge."""
 
 
 _Found = tuple[Crossings, "Tensor", "Tensor"]
 
 
 def neighbours(faces: Int[Tensor, "faces 3"], count: int) -> Int[Tensor, "3 faces"]:
-    """The face across each face's edge ``(k, k + 1)``; the number of faces where there is none.
+    """The face across each face's edge ``(k, k + 1)``; the number of faces if there is none.
 
-    The neighbour is the face that has the edge in the opposite direction; of several, one.
+    The neighbour is a face that has the edge in the opposite direction; if there are several, any
+    of them.
     """
     start, end = faces, faces.roll(-1, 1)
     own = (start * count + end).t().reshape(-1)
@@ -76,21 +77,21 @@ def neighbours(faces: Int[Tensor, "faces 3"], count: int) -> Int[Tensor, "3 face
 
 @dataclass(frozen=True)
 class _Segments:
-    """The parts of edges in front of the near plane, m of them, and the scan lines they meet."""
+    """m edges, clipped at the near plane, and the scan lines they cross."""
 
     p: Float[Tensor, "3 m"]
-    """One end in pixels, along and across the lines, and 1/w there; the other end is ``q``."""
+    """One end, in pixels along and across the lines, and 1/w; ``q`` is the other end."""
     q: Float[Tensor, "3 m"]
     view: Int[Tensor, " m"]
     face: Int[Tensor, " m"]
     start: Int[Tensor, " m"]
     end: Int[Tensor, " m"]
     preferred: Bool[Tensor, " m"]
-    """Whether the scan lines are those that cross the edge at the greater angle."""
+    """Whether the scan lines cross the edge at the larger angle."""
     first: Float[Tensor, " m"]
-    """First scan line whose pixel centres it passes between."""
+    """First scan line on which it passes between pixel centres."""
     count: Int[Tensor, " m"]
-    """How many scan lines there are."""
+    """Number of scan lines."""
 
 
 @torch.no_grad()
@@ -103,12 +104,12 @@ def find_crossings(
     visible: Visible,
     near: float,
 ) -> Crossings:
-    """All places where a visible contour edge separates two pixels."""
+    """Find all visible contour edges that separate two pixels."""
     edges = _contour_edges(points, corners, across, front, pairs.chosen)
     ends = _ends(points, edges, near)
     found: list[_Found] = []
     held = 0
-    # An edge competes for being the outermost along both, though only one will be used.
+    # An edge competes to be outermost in both directions, though only one is used.
     for along_row in (True, False):
         segments = _segments(ends, edges, visible.depth, along_row)
         begin = 0
@@ -117,7 +118,7 @@ def find_crossings(
             found.append(_seen_crossings(part, visible.depth, along_row))
             begin += size
             held += len(found[-1][1])
-            if held > MOST_CROSSINGS:  # many faces in one place would otherwise fill the memory
+            if held > MOST_CROSSINGS:  # many coincident faces would otherwise fill the memory
                 found = [_outermost_of(found)]
                 held = len(found[0][1])
     crossings, _, preferred = _outermost_of(found)
@@ -125,7 +126,7 @@ def find_crossings(
 
 
 def _outermost_of(found: list[_Found]) -> _Found:
-    """Of crossings, their distances and whether they are preferred: those outermost, in order."""
+    """Select the outermost crossings, with their distances and preferences, in order."""
     columns = [[getattr(each, f.name) for each, _, _ in found] for f in fields(Crossings)]
     every = Crossings(*(torch.cat(column, dim=-1) for column in columns))
     distance = torch.cat([each for _, each, _ in found])
@@ -135,14 +136,14 @@ def _outermost_of(found: list[_Found]) -> _Found:
 
 
 def _part(record: Any, index: slice | Tensor) -> Any:
-    """Pick elements of each tensor of a record, along its last dimension."""
+    """Index each tensor of a record along its last dimension."""
     return replace(record, **{f.name: getattr(record, f.name)[..., index] for f in fields(record)})
 
 
 def _contour_edges(
     points: Tensor, corners: Tensor, across: Tensor, front: Tensor, chosen: Tensor
 ) -> tuple[Tensor, ...]:
-    """View, face, and start and end in (views, vertices) of the edges that front faces end at."""
+    """View, face, and start and end in (views, vertices) of the contour edges."""
     away = torch.cat([~front, front.new_ones(len(front), 1)], dim=1)
     found = []
     for k in range(3):
@@ -157,8 +158,8 @@ def _contour_edges(
 def _ends(
     points: Tensor, edges: tuple[Tensor, ...], near: float
 ) -> tuple[Float[Tensor, "3 m"], Float[Tensor, "3 m"], Bool[Tensor, " m"]]:
-    """Edges cut at the near plane and projected: column, row and 1/w of both ends. And whether any
-    of the edge is in front of that plane."""
+    """Clip edges at the near plane and project them: column, row and 1/w of both ends, and whether
+    any part is in front of that plane."""
     _, _, start, end = edges
     flat = points.reshape(3, -1)
     a, b = flat.index_select(1, start), flat.index_select(1, end)
@@ -177,7 +178,7 @@ def _ends(
 def _segments(
     ends: tuple[Tensor, ...], edges: tuple[Tensor, ...], depth: Tensor, along_row: bool
 ) -> _Segments:
-    """The rows or columns that projected edges meet."""
+    """The rows or columns that projected edges cross."""
     view, face, start, end = edges
     p, q, in_front = ends
     if not along_row:
@@ -195,9 +196,10 @@ def _segments(
 def _seen_crossings(
     segments: _Segments, depth: Tensor, along_row: bool
 ) -> tuple[Crossings, Tensor, Tensor]:
-    """Where segments pass between two pixels, in front of the farther; ``s``, and ``preferred``."""
+    """Crossings where segments pass between two pixels, in front of the farther one, with ``s`` and
+    ``preferred``."""
     height, width = depth.shape[1:]
-    # From pixel to pixel on a line, from line to line, and where the last pair's first pixel is.
+    # Strides between pixels and between lines, and the first pixel of the last pair.
     next_pixel, next_line = (1, width) if along_row else (width, 1)
     last = (width if along_row else height) - 2
     owner, step = ragged(segments.count)
@@ -213,7 +215,7 @@ def _seen_crossings(
     in_frame = (before >= 0) & (before <= last)
     before = before.nan_to_num_(nan=0.0).clamp_(0, max(last, 0))
     fraction = crossing.sub_(before).sub_(0.5)
-    # A front face is to the right of its edges that go down, below those that go left.
+    # A front face is to the right of its downward edges, and below its leftward ones.
     inner_last = (segments.q[1] > segments.p[1]) == along_row
     shift = (inner_last * next_pixel).index_select(0, owner)
     is_last = inner_last.to(fraction.dtype).index_select(0, owner)
@@ -248,8 +250,8 @@ def _seen_crossings(
 
 
 def _outermost(crossings: Crossings, distance: Tensor) -> Int[Tensor, " pixel_pairs"]:
-    """The index of the outermost edge between each pair of pixels."""
-    # A row's and a column's pair may have the same first pixel; the parity tells them apart.
+    """Index of the outermost edge between each pair of pixels."""
+    # A row pair and a column pair may share their first pixel; the parity distinguishes them.
     pair = torch.minimum(crossings.inner, crossings.outer) * 2 + crossings.along_row
     fine = 1 << 20  # steps of distance, and the outermost edge of each pair comes last
     order = (pair * (2 * fine) + (distance.clamp(0, 1) * fine).long()).argsort(stable=True)
@@ -259,11 +261,11 @@ def _outermost(crossings: Crossings, distance: Tensor) -> Int[Tensor, " pixel_pa
 
 
 class CrossingDistance(torch.autograd.Function):
-    """Distance in pixels from each inner pixel's centre to its edge, towards the outer pixel.
+    """Distance, in pixels, from each inner pixel's centre to its edge, towards the outer pixel.
 
     Takes homogeneous pixels (3, views, V) and ``Crossings``; returns (n). With the vertices'
     offsets from the pixel's ray, ``(x w - column w, y w - row w)``, the line through both needs no
-    division by their depths, and so holds for edges that reach behind the camera.
+    division by depth, so it is also valid for edges that extend behind the camera.
     """
 
     @staticmethod
@@ -283,7 +285,7 @@ class CrossingDistance(torch.autograd.Function):
         distance = (a_u * b_v - b_u * a_v) * scale
         ctx.crossings, ctx.shape = crossings, points.shape
         ctx.save_for_backward(a[2], b[2], a_u, a_v, b_u, b_v, scale, distance * crossings.direction)
-        return distance.clamp(0, 1)  # rounding may put it a hair outside of the pair
+        return distance.clamp(0, 1)  # rounding may put it slightly outside the pair
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
@@ -306,19 +308,20 @@ class CrossingDistance(torch.autograd.Function):
 
 
 class Compose(torch.autograd.Function):
-    """Put intensities on a background and mix pixels across outlines: images and coverage.
+    """Composite intensities over a background and blend pixels across outlines.
 
-    Takes the intensities (channels, winners) of the visible pixels, these, the background, and of n
-    crossings the distances ``s`` (n), the intensities right at the outline, on its inside
-    (channels, n), and the inner and outer pixels (n), or four times None. Returns images
-    (channels, pixels) and coverage (pixels).
+    Takes the visible pixels' intensities (channels, winners) and indices, the background, and for n
+    crossings the distances ``s`` (n), the intensities just inside the outline (channels, n), and
+    the inner and outer pixels (n), or None for all four. Returns images (channels, pixels) and
+    coverage (pixels).
 
-    A pixel takes the part ``|s - 0.5|`` of its neighbour; if its neighbours' parts come to more
-    than one they are scaled to one, so that a result never leaves the range of what it mixes.
+    A pixel is blended with its neighbour by ``|s - 0.5|``. If the weights of its neighbours sum to
+    more than one, they are scaled to one, so that the result stays within the range of its inputs.
 
-    What an outline sweeps over changes from the outer pixel's value to that at the outline. That,
-    not the value half a pixel inside, makes the derivative by the distance: on a round object
-    shading changes fast towards the outline, and the inner pixel's would be up to 15 % off.
+    The area that an outline sweeps changes from the outer pixel's value to that at the outline. So
+    the derivative by the distance uses the value at the outline, not that half a pixel inside: on
+    round objects shading changes fast near the outline, and the inner pixel's value would be up to
+    15 % off.
     """
 
     @staticmethod
@@ -332,7 +335,7 @@ class Compose(torch.autograd.Function):
         inner: Tensor | None,
         outer: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
-        """Add each part of the difference to the neighbour's value."""
+        """Blend each pixel towards its neighbours."""
         image = intensities.new_full((len(intensities), visible.depth.numel()), background)
         for row, values in zip(image, intensities, strict=True):
             row.scatter_(0, visible.pixel, values)
@@ -349,7 +352,7 @@ class Compose(torch.autograd.Function):
         total = part.new_zeros(len(coverage)).scatter_add_(0, target, part).index_select(0, target)
         scale = 1 / total.clamp_min(1)
         weight = part.mul_(scale)
-        # Where parts are scaled, more of one means less of the others.
+        # Where weights are scaled, increasing one decreases the others.
         shared = torch.where(total > 1, 2 * shrinks.to(scale.dtype) - 1, 0.0)
         jumps = []
         for row, at_outline in zip(
@@ -361,7 +364,7 @@ class Compose(torch.autograd.Function):
             if len(target):
                 low, high = torch.aminmax(row)
                 row.scatter_add_(0, target, change)
-                # Sums round, and must not leave the range of what they mix.
+                # Clamp, because rounding could leave the range of the inputs.
                 row.scatter_(0, target, row.index_select(0, target).clamp_(low, high))
             moved = row.index_select(0, target).sub_(before)
             jumps.append(jump.addcmul_(moved, shared).mul_(scale))
@@ -372,7 +375,7 @@ class Compose(torch.autograd.Function):
     def backward(
         ctx: Any, to_image: Tensor | None, to_coverage: Tensor | None
     ) -> tuple[Tensor | None, ...]:
-        """Values pass through to both pixels, distances feel the jump."""
+        """Propagate to both pixels' values, and to distances by the jump in value."""
         nothing = (None,) * 4
         if not ctx.saved_tensors:
             given = None if to_image is None else to_image.index_select(1, ctx.pixel)

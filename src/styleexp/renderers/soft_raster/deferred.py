@@ -1,7 +1,7 @@
-"""Deferred rendering: find out which face is seen where, then shade and anti-alias only that.
+"""Deferred rendering: find the visible face per pixel, then shade and anti-alias only those.
 
-Finding out (``DeferredRenderer.find_visible``) is not differentiated, and is all that the backends
-built on this differ in; light, outlines and every gradient are theirs in common.
+Finding visible faces (``DeferredRenderer.find_visible``) is not differentiated, and is the only
+difference between backends built on this; they share light, outlines and all gradients.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ if TYPE_CHECKING:
 
 VISIBILITY_GRADIENTS = ("contour", "none")
 MOST_PAIRS = 1 << 22
-"""Views times faces (or vertices) that are rendered at once without gradients: bounds memory."""
+"""Views times faces (or vertices) rendered per batch without gradients: bounds memory."""
 
 
 @dataclass(frozen=True)
 class Projected:
-    """A mesh on the screens of all views: what visibility is found from. Without gradients."""
+    """A mesh projected to all views, the input for visibility. Without gradients."""
 
     points: Float[Tensor, "3 views vertices"]
     """Homogeneous pixels ``(column w, row w, w)``; see ``pixel_projection``."""
     corners: Int[Tensor, "3 faces"]
     pairs: FacePairs
-    """The faces that each view may see; all others can be left out."""
+    """The candidate faces of each view; all others can be skipped."""
     near: float
-    """Nothing nearer than this, in world units along the viewing axis, is seen."""
+    """Near plane, in world units along the viewing axis."""
     resolution: tuple[int, int]
     """(height, width) in pixels."""
 
@@ -53,15 +53,15 @@ class Projected:
 class DeferredRenderer(Renderer):
     """Hard visibility, exact shading gradients, contour-edge visibility gradients.
 
-    ``visibility_gradient`` is ``contour`` (outlines are anti-aliased and carry the gradient of what
-    covers what) or ``none`` (hard outlines; the gradient is that of shading alone). Grey images
-    (one channel), float32 or float64 after the vertices, any device that torch knows. Raises
-    ``UserError`` for an unknown ``visibility_gradient`` or ``Shading.normals``.
+    ``visibility_gradient`` is ``contour`` (anti-aliased outlines with visibility gradients) or
+    ``none`` (hard outlines, shading gradients only). Grey images (one channel), float32 or float64
+    like the vertices, on any torch device. Raises ``UserError`` for an unknown
+    ``visibility_gradient`` or ``Shading.normals``.
 
-    Against finite differences of an 8 times supersampled render, gradients of smoothly shaded
-    images and of coverage are within 10 %. Those of flat shaded images lack one thing: the borders
-    between neighbouring faces' grey levels move too, and only outlines are accounted for here.
-    ``capabilities`` are those of ``contour``.
+    Gradients of smoothly shaded images and of coverage are within 10 % of finite differences of an
+    8x supersampled render. Gradients of flat-shaded images ignore that borders between neighbouring
+    faces' grey levels move; only outlines are accounted for. ``capabilities`` are those of
+    ``contour``.
     """
 
     capabilities = Capabilities(
@@ -76,7 +76,7 @@ class DeferredRenderer(Renderer):
 
     @abstractmethod
     def find_visible(self, projected: Projected) -> Visible:
-        """The nearest front face at every pixel centre. Called with gradients off."""
+        """Find the nearest front face at every pixel centre. Called without gradients."""
 
     def render(
         self,
@@ -99,10 +99,10 @@ class DeferredRenderer(Renderer):
         lights: Float[Tensor, "lights views 3"],
         resolution: tuple[int, int],
     ) -> RenderOutput:
-        """All lights on what is found to be seen once; see ``Renderer.render_lights``."""
+        """Apply all lights to shared visibility; see ``Renderer.render_lights``."""
         if shading.normals not in ("flat", "smooth"):
             raise unknown_name("kind of normals", shading.normals, ("flat", "smooth"))
-        # Views don't depend on each other, so without gradients they need not be there at once.
+        # Views are independent, so without gradients they can be rendered in batches.
         at_once = max(1, MOST_PAIRS // max(faces.shape[0], vertices.shape[0], 1))
         if len(cameras) <= at_once or (torch.is_grad_enabled() and vertices.requires_grad):
             return self._render(vertices, faces, cameras, shading, lights, resolution)
@@ -162,13 +162,13 @@ class DeferredRenderer(Renderer):
         )
 
     def _neighbours(self, faces: Tensor, count: int) -> Int[Tensor, "3 faces"]:
-        """Faces across edges; remembered, since a fit renders the same topology many times."""
+        """Faces across edges; cached, since a fit renders the same topology many times."""
         if self._known is None or self._known[0] is not faces or self._known[1] != faces._version:
             self._known = (faces, faces._version, neighbours(faces.long(), count))
         return self._known[2]
 
 
 def _eyes(cameras: Cameras, like: Tensor) -> Float[Tensor, "views 3"]:
-    """Positions of the cameras in the world."""
+    """World positions of the cameras."""
     rotation, translation = cameras.rotation.to(like), cameras.translation.to(like)
     return -(rotation * translation[:, :, None]).sum(1)

@@ -1,7 +1,7 @@
-"""Where the mesh is on the screen and which way its surface points.
+"""Projection and normals.
 
-Everything here is laid out as one array per coordinate ("structure of arrays"): gathers and
-scatters along one dimension are several times faster in torch than those of short rows.
+Data is stored as one array per coordinate ("structure of arrays"): in torch, gathers and scatters
+along one dimension are several times faster than those of short rows.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ _TINY_SQUARED = 1e-25  # squared length under which a vector has no direction: t
 def pixel_projection(
     cameras: Cameras, resolution: tuple[int, int], like: Tensor
 ) -> Float[Tensor, "3 views 4"]:
-    """Matrices from world points ``(x, y, z, 1)`` to homogeneous pixels ``(column w, row w, w)``.
+    """Matrices that map world points ``(x, y, z, 1)`` to homogeneous pixels ``(column w, row w,
+    w)``.
 
-    ``w`` is the depth of ``RenderOutput.depth``; dividing by it gives pixel coordinates, in which
+    ``w`` is the depth of ``RenderOutput.depth``; dividing by it gives pixel coordinates, where
     pixel (r, c) has its centre at ``(c + 0.5, r + 0.5)``. Dtype and device are those of ``like``.
     """
     height, width = resolution
@@ -41,15 +42,16 @@ def pixel_projection(
 
 
 class Project(torch.autograd.Function):
-    """Vertices (V, 3) and ``pixel_projection`` matrices to homogeneous pixels (3, views, V).
+    """Project vertices (V, 3) with ``pixel_projection`` matrices to homogeneous pixels (3, views,
+    V).
 
-    Elementwise forward, so that a view's bits do not depend on the others in the batch; a matrix
-    product would choose its kernel by the batch size. The matrices get no gradient.
+    The forward pass is elementwise, so that a view's bits don't depend on the rest of the batch; a
+    matrix product would select its kernel by batch size. The matrices get no gradient.
     """
 
     @staticmethod
     def forward(ctx: Any, vertices: Tensor, matrix: Tensor) -> Tensor:
-        """Map every vertex into every view."""
+        """Project every vertex to every view."""
         x, y, z = vertices.t().contiguous()
         columns = matrix.unsqueeze(-1)
         points = torch.addcmul(columns[:, :, 3], columns[:, :, 0], x)
@@ -66,9 +68,9 @@ class Project(torch.autograd.Function):
 
 
 class FaceNormals(torch.autograd.Function):
-    """Vertices (V, 3) and corner indices (3, F) to area-weighted face normals (3, F).
+    """Area-weighted face normals (3, F) from vertices (V, 3) and corner indices (3, F).
 
-    The length is twice the area; the direction is outside for counter-clockwise faces.
+    The length is twice the area; the direction is outward for counter-clockwise faces.
     """
 
     @staticmethod
@@ -98,7 +100,7 @@ class FaceNormals(torch.autograd.Function):
 
 
 class SumAtVertices(torch.autograd.Function):
-    """Values of faces (3, F) and corner indices (3, F) to their sums at the vertices (3, V)."""
+    """Sum face values (3, F) at the vertices (3, V), given corner indices (3, F)."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, corners: Tensor, count: int) -> Tensor:
@@ -120,7 +122,7 @@ class SumAtVertices(torch.autograd.Function):
 
 
 def unit(vectors: Float[Tensor, "3 n"]) -> Float[Tensor, "3 n"]:
-    """Vectors of length one; those too short to have a direction become 0 and pass no gradient."""
+    """Normalise vectors; those too short to have a direction become 0 and pass no gradient."""
     squared = (vectors * vectors).sum(0)
     has_direction = squared > _TINY_SQUARED
     scale = torch.where(has_direction, squared, 1.0).rsqrt()
@@ -130,13 +132,13 @@ def unit(vectors: Float[Tensor, "3 n"]) -> Float[Tensor, "3 n"]:
 def vertex_normals(
     face_normals: Float[Tensor, "3 faces"], corners: Int[Tensor, "3 faces"], count: int
 ) -> Float[Tensor, "3 vertices"]:
-    """Unit normals of the vertices, their faces weighted by area."""
+    """Unit vertex normals, area-weighted."""
     return unit(SumAtVertices.apply(face_normals, corners, count))
 
 
 def _cross(a: Any, b: Any) -> list[Tensor]:
-    # Not by `addcmul`, which rounds once: a face without area has a normal of exactly zero only
-    # where both products are rounded alike.
+    # Don't use `addcmul`, which rounds only once: a zero-area face has a normal of exactly zero
+    # only if both products are rounded alike.
     return [
         a[1] * b[2] - a[2] * b[1],
         a[2] * b[0] - a[0] * b[2],

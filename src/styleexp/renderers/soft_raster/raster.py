@@ -1,11 +1,10 @@
-"""Visibility: which face is seen at which pixel. Nothing here is differentiated.
+"""Visibility: the visible face per pixel. Not differentiated.
 
-Faces become triangles in pixel coordinates (``Triangles``), clipped at the near plane; in each row
-of pixels these are spans between two edges; the nearest of each pixel's spans wins.
+Faces are projected to triangles in pixel coordinates (``Triangles``), clipped at the near plane. In
+each pixel row a triangle is a span between two edges; the nearest span at each pixel wins.
 
-The spans are watertight: where an edge crosses a row is the same number, bit for bit, from its two
-sides, because it is anchored at the edge's midpoint, and a pixel centre on an edge belongs to the
-side given by the top-left rule.
+Spans are watertight: an edge's crossing with a row is bit-identical from both sides, because it is
+anchored at the edge's midpoint, and a pixel centre on an edge is assigned by the top-left rule.
 """
 
 from __future__ import annotations
@@ -23,24 +22,24 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 _CHUNK = 1 << 18
-"""About how many rows of triangles, or pixels of rows, are worked on at once: bounds memory."""
+"""Approximate number of triangle rows, or of their pixels, per batch: bounds memory."""
 _AT_ONCE = 1 << 16
-"""Triangles whose spans are looked for at once, so that what is between fits the cache."""
+"""Triangles per batch when finding spans, so that intermediates fit the cache."""
 _FAR = 1e30
-"""Added to where an edge crosses a row, it takes the edge out of a maximum or minimum."""
+"""Offset that excludes an edge's crossing from a maximum or minimum."""
 
 
 @dataclass(frozen=True)
 class FacePairs:
-    """Pairs (view, face) that may be seen: facing the camera and not wholly outside the frame.
+    """Candidate pairs (view, face): facing the camera and not entirely outside the frame.
 
-    In order of the views, and in each of the faces.
+    Sorted by view, then by face.
     """
 
     view: Int[Tensor, " pairs"]
     face: Int[Tensor, " pairs"]
     needs_clipping: Bool[Tensor, " pairs"]
-    """A corner lies in front of the near plane, or behind the camera."""
+    """Whether a corner is in front of the near plane, or behind the camera."""
     chosen: Bool[Tensor, "views faces"]
     """The pairs as a mask."""
 
@@ -58,12 +57,12 @@ class Triangles:
 
 @dataclass(frozen=True)
 class Visible:
-    """The winners of the depth test, pixel by pixel and as lists of the covered pixels."""
+    """Winners of the depth test, as images and as lists of the covered pixels."""
 
     face_ids: Int[Tensor, "views height width"]
     depth: Float[Tensor, "views height width"]
     pixel: Int[Tensor, " winners"]
-    """Index into the flattened (views, height, width)."""
+    """Index of each covered pixel into the flattened (views, height, width)."""
     view: Int[Tensor, " winners"]
     face: Int[Tensor, " winners"]
 
@@ -76,7 +75,7 @@ def facing(
 ) -> Bool[Tensor, "views faces"]:
     """Whether the camera is on the outer side of each face's plane.
 
-    Decided in the world, so that it also holds for faces that reach behind the camera.
+    Evaluated in world space, so that it is also valid for faces that extend behind the camera.
     """
     x, y, z = vertices.t().contiguous().index_select(1, corners[0])
     offset = face_normals[0] * x + face_normals[1] * y + face_normals[2] * z
@@ -92,10 +91,10 @@ def candidate_pairs(
     near: float,
     resolution: tuple[int, int],
 ) -> FacePairs:
-    """Drop back faces and faces on the outer side of the near plane or of one side of the frame."""
+    """Cull back faces, and faces outside the near plane or one side of the frame."""
     height, width = resolution
     x, y, w = points
-    # The sides of the frame are planes in homogeneous pixels, so the tests also hold where w < 0.
+    # The frame's sides are planes in homogeneous pixels, so the tests are also valid for w < 0.
     outside = (x < 0).byte()
     outside |= (x > width * w).byte() << 1
     outside |= (y < 0).byte() << 2
@@ -114,7 +113,7 @@ def candidate_pairs(
 
 
 def take(rows: Tensor, columns: Int[Tensor, " n"]) -> Tensor:
-    """``rows[:, columns]``; of bytes, a row at a time is three times as fast."""
+    """``rows[:, columns]``; for bytes, going row by row is three times as fast."""
     taken = rows.new_empty(len(rows), len(columns))
     for row, into in zip(rows, taken, strict=True):
         torch.index_select(row, 0, columns, out=into)
@@ -122,21 +121,22 @@ def take(rows: Tensor, columns: Int[Tensor, " n"]) -> Tensor:
 
 
 def positions(mask: Bool[Tensor, "rows columns"]) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
-    """Row and column of what is true, in order."""
+    """Row and column of each true element, in order."""
     place = true_indices(mask.reshape(-1))
     row = _rows_of(place, *mask.shape)
     return row, torch.sub(place, row, alpha=mask.shape[1])
 
 
 def _rows_of(place: Int[Tensor, " n"], rows: int, columns: int) -> Int[Tensor, " n"]:
-    """The rows of places, given in order, in a flattened array. Division would take longer."""
+    """Rows of sorted indices into a flattened array. Faster than division."""
     ends = torch.searchsorted(place, torch.arange(1, rows + 1, device=place.device) * columns)
     counts = ends.diff(prepend=ends.new_zeros(1))
     return torch.repeat_interleave(counts, output_size=len(place))
 
 
 def true_indices(mask: Bool[Tensor, " n"]) -> Int[Tensor, " true"]:
-    """Where a mask is true. On the CPU by numpy, whose search has no branches: 7 times as fast."""
+    """Indices of true elements. Uses NumPy on the CPU, whose branchless search is 7 times as
+    fast."""
     if mask.device.type != "cpu":
         return mask.nonzero().view(-1)
     return torch.from_numpy(np.flatnonzero(mask.numpy()))
@@ -149,7 +149,7 @@ def rasterise(
     near: float,
     resolution: tuple[int, int],
 ) -> Visible:
-    """Find the nearest face at every pixel centre; equal depth goes to the lowest face index."""
+    """Find the nearest face at every pixel centre; ties go to the lowest face index."""
     views = points.shape[1]
     height, width = resolution
     best = torch.zeros(views * height * width, dtype=torch.int64, device=points.device)
@@ -200,14 +200,14 @@ def _triangles(points: Tensor, corners: Tensor, pairs: FacePairs, near: float) -
 
 
 def _clip(corners: Float[Tensor, "3 3 n"], near: float) -> Float[Tensor, "3 3 2n"]:
-    """Cut triangles, given as (corner, coordinate, triangle), at ``w = near`` and project them.
+    """Clip triangles, given as (corner, coordinate, triangle), at ``w = near`` and project them.
 
-    Returns (coordinate, corner, triangle) of x, y and 1/w; two triangles each, the second without
-    area where the part in front is itself a triangle.
+    Returns (coordinate, corner, triangle) of x, y and 1/w; two triangles each, the second with zero
+    area if the front part is itself a triangle.
     """
     in_front = corners[:, 2] >= near
     number = in_front.sum(0)
-    # Turn each triangle until its corners in front come first: one (a), or two (a, b).
+    # Rotate each triangle's corners so that those in front come first: one (a), or two (a, b).
     ahead = in_front & ~in_front.roll(1, 0)
     start = ahead.byte().argmax(0)
     order = (start + torch.arange(3, device=start.device)[:, None]) % 3
@@ -223,7 +223,7 @@ def _clip(corners: Float[Tensor, "3 3 n"], near: float) -> Float[Tensor, "3 3 2n
 
 
 def _cut(a: Float[Tensor, "3 n"], b: Float[Tensor, "3 n"], near: float) -> Float[Tensor, "3 n"]:
-    """Where the edge meets the near plane: the same bits from either side of the edge."""
+    """Intersection of an edge with the near plane, bit-identical from either side of the edge."""
     forward = a[2] < b[2]
     low, high = torch.where(forward, a, b), torch.where(forward, b, a)
     rise = high[2] - low[2]
@@ -236,16 +236,16 @@ def _cut(a: Float[Tensor, "3 n"], b: Float[Tensor, "3 n"], near: float) -> Float
 def _rows(
     t: Triangles, resolution: tuple[int, int]
 ) -> tuple[Float[Tensor, " triangles"], Int[Tensor, " triangles"]]:
-    """The first row of pixel centres that each triangle may contain, and how many.
+    """First row of pixel centres that each triangle may contain, and the number of rows.
 
-    From its top, included, to its bottom, excluded; none for one that lies between two columns, or
-    has a corner that is not a number.
+    The top is inclusive, the bottom exclusive. There are none if the triangle lies between two
+    columns or has a NaN corner.
     """
     height, width = resolution
     top, bottom = _range(t.y)
     first = top.sub_(0.5).ceil_().clamp_(0, height)
     count = bottom.sub_(0.5).ceil_().clamp_(0, height).sub_(first)
-    # Rounding may move where an edge crosses a row: left out is what is clearly between columns.
+    # Rounding may move a crossing, so only drop triangles clearly between columns.
     left, right = _range(t.x)
     left, right = (
         left.sub_(0.51).ceil_().clamp_(0, width),
@@ -255,12 +255,12 @@ def _rows(
 
 
 def _by_count(counts: Int[Tensor, " n"]) -> tuple[Int[Tensor, " m"], list[tuple[int, slice]]]:
-    """Of items that hold ``counts`` elements each the m that hold any, first those with one, then
-    those with two, and so on; and the parts of this order that hold equally many.
+    """Sort the m non-empty items by their number of elements, ``counts``; also return the slices of
+    this order with equal counts.
 
-    Such a part is worked on as one dense array, of not many more than _CHUNK elements.
+    Each slice is processed as one dense array of not many more than _CHUNK elements.
     """
-    if counts.device.type == "cpu":  # numpy sorts short integers by their digits
+    if counts.device.type == "cpu":  # numpy uses radix sort for short integers
         most = int(counts.max()) if len(counts) else 0
         kind = torch.uint8 if most < 1 << 8 else torch.int16 if most < 1 << 15 else torch.int32
         short = counts.to(kind)
@@ -282,10 +282,10 @@ def _by_count(counts: Int[Tensor, " n"]) -> tuple[Int[Tensor, " m"], list[tuple[
 class _Edges:
     """One edge of each triangle. It crosses row ``y`` at ``x + (y - middle_y) * slope``.
 
-    ``x`` is ``left`` for the edges that bound a triangle on its left, ``right`` for those on its
-    right; for others it is so far away that they bound nothing. An edge that goes down has the
-    triangle to its right, and what is on it belongs there; one that goes up, to its left. Level
-    edges bound no row: the choice of rows sees to them.
+    ``x`` is ``left`` for edges that bound a triangle on its left, ``right`` for those on its right;
+    otherwise it is so far away that the edge bounds nothing. A downward edge has the triangle to
+    its right and owns pixels on it; an upward edge has it to its left. Horizontal edges bound no
+    row; they are handled by the range of rows.
     """
 
     left: Float[Tensor, " triangles"]
@@ -296,30 +296,30 @@ class _Edges:
 
 @dataclass(frozen=True)
 class _Setup:
-    """What is known of triangles before their pixels."""
+    """Per-triangle setup of the rasteriser."""
 
     edges: tuple[_Edges, ...]
     first: Float[Tensor, " triangles"]
-    """The first row."""
+    """First row."""
     start: Int[Tensor, " triangles"]
     """Index of the first row's first pixel into the flattened (views, height, width)."""
     low: Int[Tensor, " triangles"]
-    """The lower half of the depth test's key: the inverted index of the face."""
+    """Lower half of the depth test's key: the inverted face index."""
     x: Float[Tensor, " triangles"]
     y: Float[Tensor, " triangles"]
     inverse_w: Float[Tensor, " triangles"]
-    """1/w at ``(x, y)``; from there it is linear in the image."""
+    """1/w at ``(x, y)``; it is linear in the image."""
     slope_x: Float[Tensor, " triangles"]
     slope_y: Float[Tensor, " triangles"]
     lowest: Float[Tensor, " triangles"]
-    """A sliver's slopes may be anything: the range of its corners bounds 1/w."""
+    """Bounds of 1/w from the corners, because a sliver's slopes are unreliable."""
     highest: Float[Tensor, " triangles"]
 
 
 def _set_up(
     t: Triangles, first: Tensor, order: Int[Tensor, " m"], resolution: tuple[int, int]
 ) -> _Setup:
-    """The triangles in an order."""
+    """Set up the triangles, in the given order."""
     height, width = resolution
     x, y, q = ([row.index_select(0, order) for row in each] for each in (t.x, t.y, t.inverse_w))
     view, face, first = (each.index_select(0, order) for each in (t.view, t.face, first))
@@ -358,20 +358,20 @@ def _range(corners: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class _Spans:
-    """Pixels of rows that lie in a triangle."""
+    """Spans: runs of pixels of one row inside a triangle."""
 
     start: Int[Tensor, " spans"]
     """Index of the first pixel into the flattened (views, height, width)."""
     count: Int[Tensor, " spans"]
     inverse_w: Float[Tensor, " spans"]
-    """1/w at the first pixel's centre."""
+    """1/w at the centre of the first pixel."""
     slope: Float[Tensor, " spans"]
-    """What 1/w grows by from pixel to pixel."""
+    """Increment of 1/w per pixel."""
     low: Int[Tensor, " spans"]
 
 
 def _spans(setup: _Setup, part: slice, rows: int, width: int) -> _Spans:
-    """The spans of triangles that meet equally many rows, as dense arrays of (rows, triangles)."""
+    """Spans of triangles that cover equally many rows, as dense arrays of (rows, triangles)."""
     s = replace(setup, **{f.name: getattr(setup, f.name)[part] for f in fields(setup)[1:]})
     step = torch.arange(rows, device=s.x.device)[:, None]
     y = s.first + (step + 0.5).to(s.x.dtype)
@@ -384,7 +384,7 @@ def _spans(setup: _Setup, part: slice, rows: int, width: int) -> _Spans:
     beyond = functools.reduce(torch.minimum, beyonds)
     for end in (begin, beyond):
         end.sub_(0.5).ceil_().clamp_(0, width)
-    # An infinite corner's edges may cross rows nowhere: no span then.
+    # Edges at an infinite corner may not cross a row: no span then.
     count = beyond.sub_(begin).nan_to_num_(nan=0.0).clamp_min_(0)
     steps = (count - 1).clamp_min_(0)
     by_y = (y - s.y).mul_(s.slope_y).add_(s.inverse_w)
@@ -403,9 +403,9 @@ def _spans(setup: _Setup, part: slice, rows: int, width: int) -> _Spans:
 
 
 def _fill(best: Tensor, found: list[_Spans]) -> None:
-    """The depth test of all pixels of spans.
+    """Depth test of all pixels in spans.
 
-    Positive floats order as their bits do; below them, the inverted face index breaks ties.
+    Positive floats sort like their bits; the inverted face index in the lower bits breaks ties.
     """
     if not found:
         return
@@ -427,10 +427,11 @@ def chunks(counts: Int[Tensor, " n"]) -> list[int]:
 
 
 def ragged(counts: Int[Tensor, " n"]) -> tuple[Int[Tensor, " total"], Int[Tensor, " total"]]:
-    """For items that hold ``counts`` elements each: every element's item and its place therein."""
+    """For items with ``counts`` elements each: the item of every element, and its index within
+    it."""
     ends = counts.cumsum(0)
     total = int(ends[-1]) if len(ends) else 0
-    # Counting the items that have ended is twice as fast as ``repeat_interleave``.
+    # Counting finished items is twice as fast as ``repeat_interleave``.
     owner = ends.new_zeros(total + 1).scatter_add_(0, ends, torch.ones_like(ends))
     owner = owner[:total].cumsum_(0)
     place = torch.arange(total, device=counts.device)
@@ -439,8 +440,8 @@ def ragged(counts: Int[Tensor, " n"]) -> tuple[Int[Tensor, " total"], Int[Tensor
 
 
 def _winners(best: Tensor, shape: tuple[int, int, int], dtype: torch.dtype) -> Visible:
-    """Unpack the keys; the background's, 0, is that of face -1 at infinity."""
-    # A copy also of a single number, which is contiguous; torch is little-endian.
+    """Unpack the keys; the background's key, 0, is face -1 at infinity."""
+    # Copy even a single number, which counts as contiguous; torch is little-endian.
     high = best.view(torch.int32).view(-1, 2)[:, 1].clone(memory_format=torch.contiguous_format)
     pixel = true_indices(high != 0)
     view = _rows_of(pixel, shape[0], shape[1] * shape[2])

@@ -1,4 +1,4 @@
-"""The default backend: an exact rasteriser in plain torch, differentiable where it matters."""
+"""The default backend: an exact rasteriser in pure torch, with shading and visibility gradients."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ if TYPE_CHECKING:
 
 
 class SoftRaster(DeferredRenderer):
-    """Visibility found in plain torch; all else is ``DeferredRenderer``'s.
+    """Visibility in pure torch; see ``DeferredRenderer`` for the rest.
 
-    On the CPU the same input gives the same bits, also in the gradients.
+    On the CPU, results and gradients are bitwise reproducible.
     """
 
     def find_visible(self, projected: Projected) -> Visible:
-        """Rasterise watertightly; equal depth goes to the lowest face index."""
+        """Rasterise watertightly; ties go to the lowest face index."""
         return rasterise(
             projected.points,
             projected.corners,

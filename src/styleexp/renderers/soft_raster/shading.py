@@ -1,6 +1,7 @@
-"""Light on the visible surface: the differentiable intensities of the covered pixels.
+"""Shading of the visible surface: differentiable intensities of the covered pixels.
 
-The light is turned into the world once, so that normals need not be turned into every camera.
+The light is transformed to world space once, so that normals needn't be transformed to every
+camera.
 """
 
 from __future__ import annotations
@@ -27,12 +28,12 @@ if TYPE_CHECKING:
 def world_light(
     cameras: Cameras, lights: Float[Tensor, "*lights views 3"], like: Tensor
 ) -> Float[Tensor, "*lights views 3"]:
-    """Each view's light or lights, direction times strength, in world coordinates."""
+    """Each view's light or lights in world space, direction times strength."""
     return (lights.detach().to(like)[..., None] * cameras.rotation.detach().to(like)).sum(-2)
 
 
 class FlatSurface:
-    """A surface with one normal a face; its area-weighted normals are given."""
+    """A surface with one normal per face, given as area-weighted normals."""
 
     def __init__(
         self,
@@ -56,7 +57,7 @@ class FlatSurface:
 
 
 class SmoothSurface:
-    """A surface whose unit normals at vertices are interpolated over its faces."""
+    """A surface with unit vertex normals, interpolated over faces."""
 
     def __init__(
         self,
@@ -81,7 +82,7 @@ class SmoothSurface:
         """Intensities right at outlines; without gradients."""
         flat, normals = self.points.detach().reshape(3, -1), self.normals.detach()
         first = crossings.view * self.points.shape[2]
-        # How far each end is beside the pixels' line: the crossing divides the edge accordingly.
+        # The ends' distances from the pixels' line give the position of the crossing on the edge.
         axis = crossings.along_row.long()
         center = crossings.center.gather(0, axis[None])[0]
         sides, ends = [], []
@@ -101,7 +102,7 @@ def _lit(normal: Tensor, view: Tensor, light: Tensor, shading: Shading) -> Tenso
 
 
 class PickOne(torch.autograd.Function):
-    """``values.view(-1)[index]`` whose gradient is summed without sorting."""
+    """``values.view(-1)[index]``, with a gradient that is summed without sorting."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, index: Tensor) -> Tensor:
@@ -121,30 +122,31 @@ class PickOne(torch.autograd.Function):
 
 @dataclass(frozen=True)
 class FacesSeen:
-    """The faces that are seen at any pixel, m of them, in order of the views."""
+    """The m faces visible at any pixel, sorted by view."""
 
     corners: list[Int[Tensor, " m"]]
     index: list[Int[Tensor, " m"]]
-    """Of each corner in the flattened (views, V)."""
+    """Index of each corner into the flattened (views, V)."""
     column: Float[Tensor, " m"]
-    """Centre of a pixel of the frame near the face: what its matrix is relative to, since numbers
-    that are relative to the frame would lose their last digits."""
+    """Centre of a pixel near the face, the origin of its matrix; coordinates relative to the frame
+    would lose precision."""
     row: Float[Tensor, " m"]
     at_pixel: Int[Tensor, " winners"]
-    """Each covered pixel's face, one of these."""
+    """Index into these faces, per covered pixel."""
 
 
 def faces_seen(
     points: Float[Tensor, "3 views vertices"], corners: Int[Tensor, "3 faces"], visible: Visible
 ) -> FacesSeen:
-    """List them. Without gradients: normals do not depend on what matrices are relative to."""
+    """Collect the visible faces. Without gradients, because normals don't depend on the matrices'
+    origins."""
     views, count = points.shape[1:]
     height, width = visible.face_ids.shape[1:]
     key = torch.add(visible.face, visible.view, alpha=corners.shape[1])
     marked = torch.zeros(views * corners.shape[1], dtype=torch.bool, device=key.device)
     marked.scatter_(0, key, True)
     view, face = positions(marked.view(views, -1))
-    # Of the faces that nobody sees nothing is ever read.
+    # Entries of invisible faces are never read.
     place = key.new_empty(marked.shape)
     own = torch.add(face, view, alpha=corners.shape[1])
     place.scatter_(0, own, torch.arange(len(own), device=key.device))
@@ -160,22 +162,22 @@ def faces_seen(
 
 
 class NormalMatrices(torch.autograd.Function):
-    """For each face that is seen the matrix from pixels to its interpolated normals.
+    """Matrix from pixels to interpolated normals, for each visible face.
 
-    Takes the homogeneous pixels (3, views, V) and unit normals (3, V) of the vertices and the m
-    faces; returns (9, m), of each axis of the normal what it grows by from column to column, from
-    row to row, and what it is at the face's own pixel. The length is any.
+    Takes the vertices' homogeneous pixels (3, views, V) and unit normals (3, V), and the m faces.
+    Returns (9, m): for each axis of the normal, its increments per column and per row, and its
+    value at the face's own pixel. The length is arbitrary.
 
-    The weight of a vertex is the cross product of the other two vertices' offsets from the pixel's
-    ray, ``(x w - column w, y w - row w)``. That is the perspective-correct barycentric coordinate
-    times a common factor, which normalising the normal removes; it needs no division by w and so
-    holds for faces that reach behind the camera. It is linear in the pixel, so that what a face's
-    pixels have in common is worked out once.
+    A vertex's weight is the cross product of the other two vertices' offsets from the pixel's ray,
+    ``(x w - column w, y w - row w)``. This is the perspective-correct barycentric coordinate up to
+    a common factor, which normalising the normal removes. It needs no division by w, so it is also
+    valid for faces that extend behind the camera. It is linear in the pixel, so the work shared by
+    a face's pixels is done once.
     """
 
     @staticmethod
     def forward(ctx: Any, points: Tensor, normals: Tensor, seen: FacesSeen) -> Tensor:
-        """Weights of the corners times their normals, summed."""
+        """Sum the corners' normals, times their weights."""
         ctx.seen, ctx.shapes = seen, (points.shape, normals.shape)
         ctx.known = []
         out = points.new_empty(9, len(seen.column))
@@ -192,7 +194,7 @@ class NormalMatrices(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:
-        """Back through the products to normals and positions."""
+        """Propagate through the products to normals and positions."""
         seen: FacesSeen = ctx.seen
         to_points, to_normals = (grad.new_zeros(shape) for shape in ctx.shapes)
         point_rows = to_points.view(3, -1).unbind()
@@ -208,7 +210,7 @@ class NormalMatrices(torch.autograd.Function):
                 own, index = seen.corners[i][part], seen.index[i][part]
                 for into, rows in zip(to_normals, by_axis, strict=True):
                     into.scatter_add_(0, own, _dot(rows, weights[i]))
-                # The vertex enters the weights of the other two.
+                # The vertex affects the weights of the other two.
                 right, down, depth = _cross(
                     to_weights[k], offsets[j], plus=(offsets[k], to_weights[j])
                 )
@@ -221,8 +223,8 @@ class NormalMatrices(torch.autograd.Function):
 def _at_corners(
     points: Tensor, normals: Tensor, seen: FacesSeen, part: slice
 ) -> tuple[list[list[Tensor]], list[list[Tensor]], list[list[Tensor]]]:
-    """Of a part of the faces, and of each corner: its offset from the face's own pixel, the matrix
-    row from pixels to its weight, and its normal."""
+    """For a slice of the faces, each corner's offset from the face's own pixel, its row of the
+    matrix from pixels to weights, and its normal."""
     x, y, w = points.view(3, -1).unbind()
     offsets = []
     for each in seen.index:
@@ -231,18 +233,17 @@ def _at_corners(
         right = x.index_select(0, index).addcmul_(seen.column[part], depth, value=-1)
         down = y.index_select(0, index).addcmul_(seen.row[part], depth, value=-1)
         offsets.append([right, down, depth])
-    # Corners run clockwise on the screen, where rows go down.
+    # Corners are clockwise on the screen, where rows go down.
     weights = [_cross(offsets[(i + 2) % 3], offsets[(i + 1) % 3]) for i in range(3)]
     at = [[axis.index_select(0, each[part]) for axis in normals] for each in seen.corners]
     return offsets, weights, at
 
 
 class LightPixels(torch.autograd.Function):
-    """Normals of pixels from their faces' matrices, and light on them, in one step.
+    """Fused evaluation of pixel normals, from their faces' matrices, and of light.
 
-    The arguments are the ``NormalMatrices`` (9, m) of the faces seen, these, the n covered pixels,
-    the lights (lights, views, 3), and the two constants of the shading. Returns the intensities
-    (lights, n).
+    Takes the ``NormalMatrices`` (9, m) of the visible faces, the faces, the n covered pixels, the
+    lights (lights, views, 3), and the two shading constants. Returns intensities (lights, n).
     """
 
     @staticmethod
@@ -255,10 +256,10 @@ class LightPixels(torch.autograd.Function):
         albedo: float,
         ambient: float,
     ) -> Tensor:
-        """Normal, light."""
+        """Evaluate normals, then light."""
         ctx.rest = matrices.shape, seen, visible, albedo, ambient
         ctx.known = []
-        # Looked up: dividing integers takes ten times as long.
+        # Table lookup; integer division takes ten times as long.
         height, width = visible.face_ids.shape[1:]
         column, row = (torch.arange(n, device=light.device).to(light) for n in (width, height))
         centers = (column + 0.5).repeat(height), (row + 0.5).repeat_interleave(width)
@@ -273,7 +274,7 @@ class LightPixels(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        """Back through light and normalisation to the matrices."""
+        """Propagate through light and normalisation to the matrices."""
         shape, seen, visible, albedo, ambient = ctx.rest
         to_matrices = grad.new_zeros(shape)
         by_axis = to_matrices.view(3, 3, -1)
@@ -286,7 +287,7 @@ class LightPixels(torch.autograd.Function):
                 along.addcmul_(towards, each)
                 for into, axis in zip(to_normal, axes, strict=True):
                     into.addcmul_(towards, axis)
-            # Along the normal itself there is no change: normalising removes it.
+            # Normalisation removes the component along the normal itself.
             inverse = known.inverse * albedo
             face = seen.at_pixel[part]
             for rows, into, axis in zip(by_axis, to_normal, known.normal, strict=True):
@@ -298,7 +299,7 @@ class LightPixels(torch.autograd.Function):
 
 
 _AT_ONCE = 1 << 15
-"""Pixels, or faces, that are shaded at once, so that what is between fits the cache."""
+"""Pixels, or faces, shaded per batch, so that intermediates fit the cache."""
 
 
 def _parts(items: Tensor) -> list[slice]:
@@ -307,17 +308,17 @@ def _parts(items: Tensor) -> list[slice]:
 
 @dataclass(frozen=True)
 class _LitPixels:
-    """What is known of n pixels: lists are of the axes."""
+    """Intermediate values of n pixels; lists have one entry per axis."""
 
     right: Float[Tensor, " n"]
-    """Columns from the face's own pixel."""
+    """Offset in columns from the face's own pixel."""
     down: Float[Tensor, " n"]
     lights: list[list[Float[Tensor, " n"]]]
     normal: list[Float[Tensor, " n"]]
     inverse: Float[Tensor, " n"]
-    """Of the normal's length before it was normalised."""
+    """Inverse length of the normal before normalisation."""
     lit: list[Float[Tensor, " n"]]
-    """The normal times each light."""
+    """Dot product of the normal with each light."""
 
 
 def _lit_pixels(
@@ -355,8 +356,8 @@ def _dot(a: Sequence[Tensor], b: Sequence[Tensor], out: Tensor | None = None) ->
 def _cross(
     a: Sequence[Tensor], b: Sequence[Tensor], plus: tuple[Sequence[Tensor], ...] = ()
 ) -> list[Tensor]:
-    """``a`` x ``b``, plus the cross product of two others. Faster than the one in `geometry`, whose
-    result is exactly zero for parallel vectors."""
+    """``a`` x ``b``, plus the cross product of two others. Faster than the one in `geometry`, which
+    is exactly zero for parallel vectors."""
     out = []
     for j, k in ((1, 2), (2, 0), (0, 1)):
         axis = (a[j] * b[k]).addcmul_(a[k], b[j], value=-1)
