@@ -55,7 +55,10 @@ def test_the_tutorials_commands_run(tmp_path):
     for name, *arguments in listed:
         module = "styleexp" + name.removeprefix("styleexp").replace("-", ".cli.")
         if name == "styleexp" and not arguments[0].startswith("resume="):
-            arguments += [*SMALL, *(LEARNED if "method=paper_amended" in arguments else BY_SYNTHESIS)]
+            arguments += [
+                *SMALL,
+                *(LEARNED if "method=paper_amended" in arguments else BY_SYNTHESIS),
+            ]
         if name == "styleexp-metrics":
             arguments += ["--judge", "none"]
         done = warm.run("-m", module, *arguments, cwd=tmp_path, env=warm.coarse())
