@@ -227,7 +227,7 @@ def test_a_stray_triangle_is_the_remedy_not_the_camera(tmp_path):
     ball = trimesh.creation.icosphere(3)
     far = np.array([[100.0, 0, 0], [101, 0, 0], [100, 1, 0]])
     stray = np.vstack([ball.vertices, far]), np.vstack([ball.faces, [[642, 643, 644]]])
-    with pytest.raises(UserError, match=r"1 of the 1281 faces of the source .* number 1280"):
+    with pytest.raises(UserError, match=r"1 of the 1281 faces of the source .* index 1280"):
         styleexp.stylize(stray, "bubble", *SMOKE)
     assert "are far from all others" not in str(
         styleexp.stylize("critter", "bubble", *SMOKE).scene.notes
