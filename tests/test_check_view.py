@@ -174,7 +174,7 @@ def test_disagreement_is_a_warning_and_in_the_record(any_platform, tmp_path):
         written.append(tmp_path / name)
         return written[-1]
 
-    with pytest.warns(UserWarning, match=r"agrees with soft_raster's to 0\.\d+ .*0\.98"):
+    with pytest.warns(UserWarning, match=r"IoU of 0\.\d+ with soft_raster's, .*0\.98"):
         assert previews.write_check(result, write) == written
     assert json.loads((tmp_path / "check.json").read_text())["least_iou"] < 0.98
     result.scene.viewer.renderer = SoftRaster()

@@ -402,8 +402,8 @@ def test_version_is_ours(tmp_path):
     [
         (["nowhere.obj", "bubble"], "the source 'nowhere.obj' does not exist"),
         (["critter", "style.path=nowhere.png"], "the style 'nowhere.png' does not exist"),
-        (["scene.fbx", "bubble"], "'.fbx', which is not read: export it as GLB"),
-        (["part.step", "bubble"], "'.step', which is not read: export it as STL"),
+        (["scene.fbx", "bubble"], "'.fbx', which is not supported: export it as GLB"),
+        (["part.step", "bubble"], "'.step', which is not supported: export it as STL"),
         (["critter", "bubble", "optim.steps=-3"], "optim.steps=-3 is not allowed"),
     ],
 )

@@ -445,5 +445,5 @@ def test_an_encoder_that_cannot_be_had_is_not_replaced(tmp_path, monkeypatch):
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.setenv("PIP_CONFIG_FILE", os.devnull)
     monkeypatch.delenv("PIP_FIND_LINKS", raising=False)
-    with pytest.raises(UserError, match=r"weights 'vgg16' cannot be fetched.*STYLEEXP_ASSETS"):
+    with pytest.raises(UserError, match=r"weights 'vgg16' cannot be downloaded.*STYLEEXP_ASSETS"):
         load_encoder("vgg16")

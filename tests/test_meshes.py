@@ -478,7 +478,7 @@ def test_one_inward_part(tmp_path):
     far = np.concatenate([CUBE, CUBE + 5])
     faces = np.concatenate([triangles(), triangles()[:, ::-1] + 8])
     mesh = meshes.load_mesh(write_obj(tmp_path / "a.obj", far, faces))
-    assert any("turned 12 faces inside out" in note for note in mesh.repairs)
+    assert any("flipped 12 faces, because" in note for note in mesh.repairs)
     np.testing.assert_array_equal(mesh.carrier.flipped, np.arange(24) // 12 == 1)
     assert volume(mesh.vertices, mesh.faces) == pytest.approx(2)
 

@@ -277,7 +277,7 @@ def test_the_verdict_tells_a_good_metric_from_a_bad_one(source):
     assert verdict["imperfect"] == 0.0  # the three are the wrong style's
     verdict = truth._verdict(lambda *rest: 1.0 - good(*rest), board)
     assert not verdict["kept"]
-    assert verdict["confusions"] == ["torus: right taken for wrong"]
+    assert verdict["confusions"] == ["torus: right mistaken for wrong"]
 
 
 def test_of_a_board_the_nearest_style_of_the_same_kind_is_named():

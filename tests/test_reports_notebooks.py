@@ -175,7 +175,7 @@ def test_missing_and_unmeasured_runs_are_said_to_be_so(tmp_path):
     frame = notebook.runs(tmp_path, "layer_ablation")
     assert list(frame["status"]) == ["done", "done", "missing"]
     told = notebook.caution(frame)
-    assert "1 of 3 runs are not there: 1 missing" in told
+    assert "1 of 3 runs are not finished: 1 missing" in told
     assert "4 steps" in told
     assert math.isnan(notebook.mean(frame, "style_distance", axis__layers="high_vgg16"))
     claim = notebook.smaller("a", ("x", math.nan), ("y", 1.0), "z")
