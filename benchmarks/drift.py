@@ -98,10 +98,11 @@ def parts(scene: Scene, moved: torch.Tensor) -> dict[str, dict[str, float]]:
         for (name, f), within, beyond in zip(features.items(), inside, outside, strict=True):
             cells = f[:, 0].numel()
             kept = {"outline": ~(within | beyond), "interior": within, "background": beyond}
-            grams[name] = {  # sums over some cells, divided by the number of all
-                part: gram_matrix(f.float(), mask, "none") for part, mask in kept.items()
+            # Sums over some cells, divided by the number of all.
+            grams[name] = {
+                part: mean_gram(gram_matrix(f.float(), mask, "none"), None, cells)
+                for part, mask in kept.items()
             }
-            grams[name] = {k: mean_gram(v, None, cells) for k, v in grams[name].items()}
         found.append(grams)
     shares = {}
     for name, weight in zip(loss.layers, loss.weights, strict=True):

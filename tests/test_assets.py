@@ -482,7 +482,9 @@ def test_bad_download_is_tried_again(shop, cache, first):
 @pytest.mark.parametrize("always", ["cut", "wrong"])
 def test_bad_download_is_refused_in_the_end(shop, cache, always):
     shop.answers = [getattr(shop, always)]
-    with pytest.raises(UserError, match=r"'vgg19' cannot be downloaded.*put it in a folder") as caught:
+    with pytest.raises(
+        UserError, match=r"'vgg19' cannot be downloaded.*put it in a folder"
+    ) as caught:
         assets.find("vgg19", "weights")
     assert "\n" not in str(caught.value)
     assert list(cache.glob("*.safetensors")) == []

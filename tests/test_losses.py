@@ -6,7 +6,7 @@ from torch.nn import functional
 
 from styleexp.config import LossConfig
 from styleexp.encoders import Encoder, load_encoder
-from styleexp.losses import StyleLoss, gram_matrix, layer_mask, layer_masks
+from styleexp.losses import UNDIVIDED, StyleLoss, gram_matrix, layer_mask, layer_masks
 from styleexp.viewer import Images
 
 
@@ -30,7 +30,7 @@ def test_gram_is_divided_as_asked():
     features, mask = torch.rand(3, 4, 5, 6), torch.rand(3, 5, 6) < 0.5
     product = torch.einsum("vchw,vdhw,vhw->cd", features, features, mask.float())
     for how, divisor in (
-        ("none", 1),
+        ("none", UNDIVIDED),
         ("cells", mask.sum()),
         ("channels_cells", 4 * mask.sum()),
         ("mean", 16 * mask.sum()),

@@ -26,6 +26,11 @@ Grams = list["Float[Tensor, 'channels channels']"]
 """One Gram matrix per style layer, averaged over views."""
 
 
+UNDIVIDED = 1e6
+"""Common divisor of all Gram matrices with ``loss.normalisation=none``: it changes no ratio, and
+keeps the squares of gradients within float32."""
+
+
 def gram_matrix(
     features: Float[Tensor, "views channels height width"],
     mask: Bool[Tensor, "views height width"] | None = None,
@@ -50,7 +55,7 @@ def mean_gram(
 ) -> Float[Tensor, "channels channels"]:
     """Normalise a sum of F^T F over the masked cells, as in ``LossConfig.normalisation``."""
     if normalisation == "none":
-        return total
+        return total / UNDIVIDED
     count = cells if mask is None else mask.sum().clamp(min=1)
     # Dividing by C before squaring turns the sum of C x C squares into their mean.
     channels = {"cells": 1, "channels_cells": len(total), "mean": len(total) ** 2}[normalisation]
