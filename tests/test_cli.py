@@ -121,7 +121,7 @@ def test_interrupt_checkpoints_and_says_how_to_go_on(tmp_path):
 def test_an_interrupted_synthesis_says_how_to_run_it_again(tmp_path):
     folder = tmp_path / "run"
     process = warm.start(
-        "-m", "styleexp", "torus", "bubble", "source.refine=40000", "report=false",
+        "-m", "styleexp", "torus", "bubble", "source.refine=150000", "report=false",
         f"hydra.run.dir={folder}", cwd=tmp_path, env=warm.coarse(), stdout=warm.PIPE,
         stderr=warm.PIPE,
     )  # fmt: skip

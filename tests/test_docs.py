@@ -113,7 +113,7 @@ def test_configuration_reference_has_every_key_with_its_meaning(hook):
 
     written = set(re.findall(r"^\| `([\w.]+)` \|", page, re.MULTILINE))
     assert set(keys(config.Config)) <= written
-    assert "| `optim.schedule` | `cosine` | `step`: the rate is multiplied" in page
+    assert "| `optim.schedule` | `cosine` | `step`: multiply the rate" in page
     assert "One of `step`, `cosine`." in page
     assert "logger.mlflow.uri" in page
     assert "baseline.sharpness" in page

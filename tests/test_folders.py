@@ -97,7 +97,7 @@ def test_two_sweeps_at_once_keep_their_numbers_apart(where, launcher, alone, tmp
             assert sorted(each.returncode for each in done) == [0, 2]
             (refused,) = (each for each in done if each.returncode)
             told = complaint(refused)
-            assert "all' holds another sweep" in told or "is using 'all'" in told
+            assert "all' contains another sweep" in told or "is using 'all'" in told
         else:
             assert [each.returncode for each in done] == [0, 0], done[0].stderr + done[1].stderr
             names = [path.name for path in found]
@@ -165,9 +165,9 @@ def test_another_sweep_is_refused_in_a_folder_that_one_held(swept):
     cwd, asked = swept
     before = {p: p.read_bytes() for p in cwd.rglob("*") if p.is_file()}
     told = complaint(styleexp(*(a.replace("rail", "scales") for a in asked), cwd=cwd))
-    assert "'all' holds another sweep: choose another folder with hydra.sweep.dir=FOLDER" in told
+    assert "'all' contains another sweep: choose another folder with hydra.sweep.dir=FOLDER" in told
     told = complaint(styleexp("hydra.sweep.dir=all", *asked[:-1], "strength=0.5", cwd=cwd))
-    assert "'all' holds another sweep" in told
+    assert "'all' contains another sweep" in told
     assert {p: p.read_bytes() for p in cwd.rglob("*") if p.is_file()} == before
 
 

@@ -187,7 +187,7 @@ def test_wide_gaps_are_named_and_joined_when_asked(tmp_path):
     distance = float(told.split("source.weld=")[1].split()[0])
     closed = meshes.load_mesh(path, distance)
     assert len(closed.vertices) == len(points)
-    assert any(note.startswith("joined 40 vertices within ") for note in closed.repairs)
+    assert any(note.startswith("merged 40 vertices within ") for note in closed.repairs)
 
 
 def fanned(mesh):

@@ -284,7 +284,7 @@ class OptimConfig:
     nominal_steps: int | None = None
     """``step``: run length that ``rate`` and ``decay_every`` are tuned for. With other ``steps``,
     the rate is multiplied and the decay interval divided by the same factor, so that a short run
-    gets as far as a long one. null: no rescaling."""
+    gets as far as a long one; at most tenfold. null: no rescaling."""
     seed: int = 0
     unit_gradient: bool = True
     """Normalise the gradient's length in every step. Otherwise a view that shows only a few cells

@@ -57,6 +57,10 @@ class Diverged(UserError):
         )
 
 
+MOST_RATE = 10.0
+"""Most that ``optim.nominal_steps`` raises the rate: beyond, displacements saturate within a few
+steps."""
+
 WARM_UP = 0.1
 """Fraction of the run over which the cosine schedule warms up. Adam's first steps are as long as
 any other, but their direction is mostly noise."""
@@ -300,7 +304,7 @@ def blank(seen: Images) -> int:
 def learning_rate(optim: OptimConfig, step: int) -> float:
     """Learning rate of a step; see ``OptimConfig.schedule``."""
     if optim.schedule == "step":
-        shorter = (optim.nominal_steps or optim.steps) / optim.steps
+        shorter = min((optim.nominal_steps or optim.steps) / optim.steps, MOST_RATE)
         decays = math.floor(step * shorter / optim.decay_every)
         return optim.rate * shorter * optim.decay**decays
     rising = min(1.0, (step + 1) / (WARM_UP * optim.steps))

@@ -84,20 +84,20 @@ BASELINES: dict[str, Spec] = {
         "the style's height map, applied by triplanar projection: no learning, no steps",
         DisplacementMapConfig,
         _displacement_map,
-        reads=("field.sigma",),
+        reads=("field.sigma", "field.unit"),
     ),
     "geometric_textures": Spec(
         "geometric_textures",
         "a GAN on triangles, level by level (Hertz et al. 2020); mesh styles only",
         GeometricTexturesConfig,
         _geometric_textures,
-        reads=("field.sigma", "optim.steps", "optim.rate", "optim.checkpoint_every"),
+        reads=("field.sigma", "field.unit", "optim.steps", "optim.rate", "optim.checkpoint_every"),
     ),
     "synthesis": Spec(
         "synthesis",
         "the style's relief by texture synthesis on the surface, patch by patch: seconds",
         SynthesisConfig,
         _synthesis,
-        reads=("field.sigma", "field.unfold"),
+        reads=("field.sigma", "field.unit", "field.unfold"),
     ),
 }
