@@ -1,9 +1,9 @@
 """Why does a learned run drift? Measures the loss's pull at a few steps and draws it.
 
-python benchmarks/drift.py OUT.png source=spot style=bubble method=paper profile=full -- \\
-    shading.background=black
+python benchmarks/drift.py OUT.png source=spot style=bubble profile=full -- method=paper -- \\
+    method=paper_amended
 
-Overrides after `--` make a second run, drawn beside the first. Numbers go to OUT.json.
+Overrides before the first `--` are common; each `--` begins a run. Numbers go to OUT.json.
 
 At each of STEPS, over DRAWS independent draws of the views:
 
@@ -165,7 +165,7 @@ def draw(runs: list[tuple[str, list[dict[str, Any]]]], path: Path) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """Overrides, those of a second run after ``--``."""
+    """Measure and draw each run: common overrides, then each run's own after a ``--``."""
     out, *overrides = arguments
     sets: list[list[str]] = [[]]
     for override in overrides:
@@ -173,9 +173,8 @@ def main(arguments: list[str]) -> None:
             sets.append([])
         else:
             sets[-1].append(override)
-    chosen = [sets[0] + more for more in ([], *sets[1:])]
-    titles = ["as given"] + [" ".join(more) for more in sets[1:]]
-    runs = [(title, run(each)) for title, each in zip(titles, chosen, strict=True)]
+    common, *own = sets
+    runs = [(" ".join(each), run([*common, *each])) for each in own or [[]]]
     Path(out).with_suffix(".json").write_text(json.dumps(dict(runs), indent=1))
     draw(runs, Path(out))
 

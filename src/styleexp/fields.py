@@ -55,12 +55,8 @@ class FourierFeatures(nn.Module):
             encoded = torch.cat([points, *bands] if self.include_input else bands, dim=1)
             if points.requires_grad or encoded.numel() > REMEMBERED:
                 return encoded
-            self._known = (
-                key,
-                points,
-                frequencies,
-                encoded,
-            )  # keep references, so that their ids stay unique
+            # Kept references make sure that no other object gets their ids.
+            self._known = (key, points, frequencies, encoded)
         return self._known[3]
 
 
