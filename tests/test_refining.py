@@ -116,14 +116,14 @@ def test_too_many_faces_are_refused(monkeypatch):
 
 
 def test_a_run_refines_for_its_style_and_says_so():
-    from styleexp import scene
+    from styleexp import scene, sources
 
     sized = ["source=sphere", "style=scales", "style.scale=2"]
     plain = scene.load(compose([*sized, "source.refine=none"]))
     fine = scene.load(compose(sized))
     assert len(fine.source.faces) > len(plain.source.faces)
     longest = as_trimesh(fine.source).edges_unique_length.max() / fine.frame.scale
-    assert longest <= 1 / fine.sigma / scene.PER_WAVE * (1 + 1e-9)
+    assert longest <= 1 / fine.sigma / sources.PER_WAVE * (1 + 1e-9)
     assert any("refined from" in note for note in fine.notes)
     assert not any("is too coarse" in note for note in fine.notes)
 

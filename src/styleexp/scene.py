@@ -23,7 +23,7 @@ from styleexp.pictures import Heights
 from styleexp.plugins import build
 from styleexp.relief import half_range, mesh_frequency, mesh_relief, picture_frequency
 from styleexp.renderers.base import Shading
-from styleexp.sources import load_source, load_style
+from styleexp.sources import load_source, load_style, refined
 from styleexp.stages import doing
 from styleexp.viewer import Viewer
 from styleexp.views import orbit
@@ -52,13 +52,6 @@ PICTURE_DETAIL = 128
 """Longer side, in pixels, at which an image's frequency is measured; finer detail is ignored."""
 
 
-PER_WAVE = 12.0
-"""Number of longest edges per wavelength of the style's relief when refining the source; half as
-many blur the grooves between bubbles."""
-MOST_REFINED = 200_000
-"""Maximum number of faces that refining aims for."""
-SHORTER = 0.65
-"""Ratio of mean to longest edge after refining, which halves edges."""
 STRAY = 5.0
 """Distance of a vertex, as a multiple of the 99th percentile, above which its faces are stray."""
 
@@ -329,28 +322,6 @@ def choose_field(
     sigma = min(max(frequency, 1.0), 10.0) if config.sigma is None else config.sigma
     bound = BOUND_MARGIN * height if config.bound is None else config.bound
     return sigma, bound, height
-
-
-def refined(mesh: meshes.Mesh, wavelength: float, how: str) -> meshes.Mesh:
-    """Refine the mesh until its edges are short enough for a relief of this wavelength, in radii.
-    ``how`` is ``source.refine``: a target number of faces, or ``auto``, at most `MOST_REFINED`."""
-    scale = meshes.normalisation(mesh.vertices).scale
-    area = meshes.face_areas(mesh.vertices, mesh.faces).sum()
-    faces = MOST_REFINED if how == "auto" else float(how)
-    longest = math.sqrt(area / (faces * math.sqrt(3) / 4)) / SHORTER
-    doing("refining the source for the style")
-    if how == "auto":
-        return meshes.refine(mesh, max(wavelength / PER_WAVE * scale, longest))
-    # On a uniform mesh, a tiny change of the length decides if all edges are halved or only some.
-    low, high = longest / 2, longest * 2
-    fine = mesh
-    for _ in range(8):
-        longest = math.sqrt(low * high)
-        fine = meshes.refine(mesh, longest)
-        if abs(math.log(len(fine.faces) / faces)) < 0.1:
-            break
-        low, high = (longest, high) if len(fine.faces) > faces else (low, longest)
-    return fine
 
 
 def too_coarse(mesh: meshes.Mesh, wavelength: float) -> list[str]:

@@ -1,7 +1,8 @@
-"""Load the mesh or image for a configured name or path."""
+"""Load the mesh or image for a configured name or path; refine the source for a style."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -32,6 +33,14 @@ EXPORTS = {
     **dict.fromkeys((".exr", ".hdr", ".psd", ".svg", ".heic", ".raw", ".dng"), "PNG"),
 }
 """Formats to export instead, for files of common 3D programs."""
+
+PER_WAVE = 12.0
+"""Number of longest edges per wavelength of the style's relief when refining the source; half as
+many blur the grooves between bubbles."""
+MOST_REFINED = 200_000
+"""Maximum number of faces that refining aims for."""
+SHORTER = 0.65
+"""Ratio of mean to longest edge after refining, which halves edges."""
 
 _GIVEN: ContextVar[Mapping[str, Any]] = ContextVar("given", default=MappingProxyType({}))
 
@@ -78,6 +87,28 @@ def load_source(config: SourceConfig) -> meshes.Mesh:
         return mesh
     doing(f"remeshing the source to about {config.remesh:,} vertices", at_once=True)
     return meshes.remesh(mesh, config.remesh)
+
+
+def refined(mesh: meshes.Mesh, wavelength: float, how: str) -> meshes.Mesh:
+    """Refine the mesh until its edges are short enough for a relief of this wavelength, in radii.
+    ``how`` is ``source.refine``: a target number of faces, or ``auto``, at most `MOST_REFINED`."""
+    scale = meshes.normalisation(mesh.vertices).scale
+    area = meshes.face_areas(mesh.vertices, mesh.faces).sum()
+    faces = MOST_REFINED if how == "auto" else float(how)
+    longest = math.sqrt(area / (faces * math.sqrt(3) / 4)) / SHORTER
+    doing("refining the source for the style")
+    if how == "auto":
+        return meshes.refine(mesh, max(wavelength / PER_WAVE * scale, longest))
+    # On a uniform mesh, a tiny change of the length decides if all edges are halved or only some.
+    low, high = longest / 2, longest * 2
+    fine = mesh
+    for _ in range(8):
+        longest = math.sqrt(low * high)
+        fine = meshes.refine(mesh, longest)
+        if abs(math.log(len(fine.faces) / faces)) < 0.1:
+            break
+        low, high = (longest, high) if len(fine.faces) > faces else (low, longest)
+    return fine
 
 
 def load_style(config: StyleConfig) -> meshes.Mesh | np.ndarray:
