@@ -6,9 +6,9 @@ import time
 from dataclasses import asdict
 from pathlib import Path
 
-from styleexp.compose import compose
-from styleexp.reports import collect
-from styleexp.reports.collect import write
+from styleexp.config.compose import compose
+from styleexp.experiments.reports import collect
+from styleexp.experiments.reports.collect import write
 
 RUNS, STEPS = 1000, 160
 

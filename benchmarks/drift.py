@@ -31,12 +31,12 @@ import torch
 matplotlib.use("Agg")
 from matplotlib import pyplot
 
-from styleexp import stylize
-from styleexp.baselines import method
-from styleexp.compose import compose
-from styleexp.losses import gram_matrix, layer_masks, mean_gram
-from styleexp.scene import Scene
-from styleexp.stylize import State
+from styleexp.config.compose import compose
+from styleexp.method import gram
+from styleexp.method.baselines import method
+from styleexp.method.gram import State
+from styleexp.method.losses import gram_matrix, layer_masks, mean_gram
+from styleexp.method.scene import Scene
 
 STEPS = (1, 25, 50, 100)
 DRAWS = 8
@@ -53,7 +53,7 @@ def measured(scene: Scene, state: State) -> dict[str, Any]:
     parameters = list(state.field.parameters())
     gradients, pulls = [], []
     for draw in range(DRAWS):
-        d = stylize.displace(scene, state)
+        d = gram.displace(scene, state)
         d.retain_grad()
         moved = surface.vertices + d[:, None] * surface.normals
         if scene.config.optim.renormalize:

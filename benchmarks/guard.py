@@ -48,10 +48,10 @@ def least(run, repeats):
 """
 
 RENDER = """
-from styleexp import shapes
+from styleexp.inputs import shapes
 from styleexp.renderers.base import Shading
 from styleexp.renderers.soft_raster import SoftRaster
-from styleexp.views import orbit
+from styleexp.method.views import orbit
 mesh = shapes.make("bubble", {faces} // 2 + 2)
 points = torch.from_numpy(mesh.vertices).float()
 points = (points / points.norm(dim=1).max()).requires_grad_()
@@ -67,10 +67,10 @@ least(run, 5)
 """
 
 ENCODER = """
-from styleexp.config import LossConfig
+from styleexp.config.schema import LossConfig
 from styleexp.encoders import load_encoder
-from styleexp.losses import StyleLoss
-from styleexp.viewer import Images
+from styleexp.method.losses import StyleLoss
+from styleexp.method.viewer import Images
 loss = StyleLoss(LossConfig(), load_encoder("vgg19_random"))
 seen = Images(torch.rand(2, 250, 250, 3, requires_grad=True), torch.ones(2, 250, 250))
 
@@ -81,16 +81,16 @@ least(run, 5)
 """
 
 FIELD = """
-from styleexp.config import FieldConfig
-from styleexp.fields import DisplacementField
+from styleexp.config.schema import FieldConfig
+from styleexp.method.fields import DisplacementField
 field = DisplacementField(FieldConfig(), torch.Generator().manual_seed(0), 3.0, 0.1)
 points = torch.rand(20000, 3)
 least(lambda: field(field.encode(points), torch.bfloat16).sum().backward(), 5)
 """
 
 STEP = """
-from styleexp import baselines
-from styleexp.compose import compose
+from styleexp.method import baselines
+from styleexp.config.compose import compose
 config = compose(["source=torus", "style=bubble", "encoder=vgg19_random", "profile=fast",
                   "method=robust", "loss.bank_views=2", "threads=1"])
 method = baselines.method(config)

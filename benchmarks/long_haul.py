@@ -112,7 +112,7 @@ def prepare(folder: Path) -> None:
     import numpy as np
     from PIL import Image
 
-    from styleexp import meshes, shapes
+    from styleexp.inputs import meshes, shapes
 
     for name, shape in (("ball", "sphere"), ("ring", "torus"), ("knobs", "bubble"),
                         ("ridges", "rail")):  # fmt: skip
@@ -127,8 +127,8 @@ def prepare(folder: Path) -> None:
 
 def many_steps(count: int, until: float, every: int = 5) -> list[Sample]:
     """Run this many steps with the sizes of ``profile=fast``."""
-    from styleexp import baselines
-    from styleexp.compose import compose
+    from styleexp.config.compose import compose
+    from styleexp.method import baselines
 
     given = [
         "source=torus",
@@ -156,7 +156,7 @@ def many_steps(count: int, until: float, every: int = 5) -> list[Sample]:
 def renderers() -> list[str]:
     """Renderers that are usable here."""
     from styleexp import plugins
-    from styleexp.errors import UserError
+    from styleexp.system.errors import UserError
 
     found = []
     for name in ("soft_raster", "moderngl_deferred", "mitsuba_ad"):
@@ -183,8 +183,8 @@ def variants(folder: Path) -> Iterator[list[str]]:
 
 def many_runs(count: int, folder: Path, until: float, every: int = 5) -> list[Sample]:
     """Run this many in this process, time permitting, sampling resources every few runs."""
-    from styleexp.cli.run import run
-    from styleexp.compose import compose
+    from styleexp.config.compose import compose
+    from styleexp.experiments.execute import run
 
     samples, given = [], variants(folder)
     with open(os.devnull, "w") as nowhere:
@@ -322,7 +322,7 @@ def main() -> int:
     options = parser.parse_args()
     started = time.perf_counter()
     folder, wrong = Path(tempfile.mkdtemp(prefix="styleexp-haul-")), False
-    from styleexp import assets
+    from styleexp.inputs import assets
 
     known = [os.environ.get("STYLEEXP_ASSETS", ""), str(assets.cache_dir())]  # weights are there
     os.environ["STYLEEXP_ASSETS"] = os.pathsep.join(known)

@@ -12,7 +12,7 @@ tables = None  # a folder for the tables as CSV and LaTeX
 import pandas
 from IPython.display import Markdown, display
 
-from styleexp.reports import notebook as nb
+from styleexp.experiments.reports import notebook as nb
 
 runs = nb.runs(folder)
 runs["experiment"] = [path.parent.name for path in runs["path"]]

@@ -11,7 +11,7 @@ tables = None  # a folder for the tables as CSV and LaTeX
 # %%
 from IPython.display import Markdown
 
-from styleexp.reports import notebook as nb
+from styleexp.experiments.reports import notebook as nb
 
 runs = nb.runs(folder, "renderer_ablation", "backend_agreement")
 runs["renderer"] = runs.get("axis.renderer", "soft_raster")

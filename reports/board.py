@@ -14,7 +14,7 @@ from pathlib import Path
 
 from IPython.display import Image, Markdown
 
-from styleexp.reports import notebook as nb
+from styleexp.experiments.reports import notebook as nb
 
 runs = nb.runs(folder, "board")
 Markdown(nb.caution(runs))

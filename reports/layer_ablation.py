@@ -13,7 +13,7 @@ tables = None  # a folder for the tables as CSV and LaTeX
 # %%
 from IPython.display import Markdown
 
-from styleexp.reports import notebook as nb
+from styleexp.experiments.reports import notebook as nb
 
 runs = nb.runs(folder, "layer_ablation")
 runs["layers"] = (

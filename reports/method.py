@@ -12,7 +12,7 @@ tables = None  # a folder for the tables as CSV and LaTeX
 # %%
 from IPython.display import Markdown
 
-from styleexp.reports import notebook as nb
+from styleexp.experiments.reports import notebook as nb
 
 runs = nb.runs(folder, "method_ablation")
 runs["switch"] = runs.get("axis.switch", "robust")

@@ -12,8 +12,8 @@ tables = None  # a folder for the tables as CSV and LaTeX
 # %%
 from IPython.display import Markdown
 
-from styleexp.reports import notebook as nb
-from styleexp.reports.notebook import slope
+from styleexp.experiments.reports import notebook as nb
+from styleexp.experiments.reports.notebook import slope
 
 runs = nb.runs(folder, "sigma_ablation")
 runs["σ"] = runs["axis.field.sigma"].astype(float)

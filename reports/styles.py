@@ -11,8 +11,8 @@ tables = None  # a folder for the tables as CSV and LaTeX
 # %%
 from IPython.display import Markdown, display
 
-from styleexp.errors import UserError
-from styleexp.reports import notebook as nb
+from styleexp.experiments.reports import notebook as nb
+from styleexp.system.errors import UserError
 
 runs = nb.runs(folder, "mesh_styles", "multi_style", "image_styles")
 runs["source"] = runs["pair"].str.split("-").str[0]

@@ -27,7 +27,7 @@ FLAGS = (
 
 def programs():
     """Paths of chromium and its driver; a `UserError` that names what is missing."""
-    from styleexp.errors import UserError
+    from styleexp.system.errors import UserError
 
     found = [shutil.which(name) for name in ("chromium", "chromedriver")]
     if None in found:

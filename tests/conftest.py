@@ -15,7 +15,7 @@ if "STYLEEXP_ASSETS" not in os.environ and BESIDE.is_dir():
 
 def available(make):
     """What ``make`` returns. What it lacks, a `UserError`, is a skip, and in CI a failure."""
-    from styleexp.errors import UserError
+    from styleexp.system.errors import UserError
 
     try:
         return make()
@@ -30,7 +30,7 @@ def named_mesh():
     """A function from a mesh's name to its file; skips, naming it, where it can't be found."""
 
     def find(name):
-        from styleexp import assets
+        from styleexp.inputs import assets
 
         path = assets.locate(name, "mesh")
         if path is None:
@@ -43,7 +43,7 @@ def named_mesh():
 @pytest.fixture
 def coarse_shapes(monkeypatch):
     """Analytic shapes of an eighth of their vertices, as commands with `warm.coarse` have."""
-    from styleexp import shapes
+    from styleexp.inputs import shapes
 
     monkeypatch.setattr(shapes, "make", shapes.make)  # to be put back
     from coarse import sitecustomize
@@ -62,7 +62,7 @@ def valid_glbs(tmp_path_factory):
 
     import gltf_readers
 
-    from styleexp.meshes import reading, writing
+    from styleexp.inputs.meshes import reading, writing
 
     folder = tmp_path_factory.mktemp("glbs")
     pairs: dict[Path, Path | None] = {}

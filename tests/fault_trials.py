@@ -51,9 +51,10 @@ FAKETIME = "/usr/lib/x86_64-linux-gnu/faketime/libfaketime.so.1"
 
 PRELOADED = (
     "torch", "torch._dynamo", "trimesh", "hydra", "rich.console", "safetensors.torch", "PIL.Image",
-    "styleexp.cli.main", "styleexp.cli.run", "styleexp.cli.sweep", "styleexp.stylize",
-    "styleexp.previews", "styleexp.metrics", "styleexp.encoders.vgg", "styleexp.reports.page",
-    "styleexp.sweeps.runner", "styleexp.sweeps.figure", "styleexp.renderers.soft_raster",
+    "styleexp.cli.main", "styleexp.experiments.execute", "styleexp.cli.sweep", "styleexp.api",
+    "styleexp.runs.previews", "styleexp.experiments.metrics", "styleexp.encoders.vgg",
+    "styleexp.experiments.reports.page", "styleexp.experiments.sweeps.runner",
+    "styleexp.experiments.sweeps.figure", "styleexp.renderers.soft_raster",
 )  # fmt: skip
 """What processes are forked with, so that a life takes a second and not five."""
 
@@ -76,7 +77,7 @@ class Stage:
     sweep_seconds: float = 20.0
 
     def __post_init__(self) -> None:
-        from styleexp import meshes, shapes
+        from styleexp.inputs import meshes, shapes
 
         for name, shape, detail in (("ball", "sphere", 300), ("knobs", "bubble", 600)):
             mesh = shapes.make(shape, detail=detail)
@@ -345,7 +346,7 @@ def checkpoint(path: Path) -> str:
     """The digest of what a whole checkpoint holds."""
     from safetensors import safe_open
 
-    from styleexp import digests
+    from styleexp.system import digests
 
     with safe_open(path, framework="pt") as opened:
         told = opened.metadata()
@@ -384,7 +385,7 @@ def check_whole(folder: Path, whole: Path, alive: bool = False) -> None:
 
 def check_swept(folder: Path, whole: Path) -> None:
     """All jobs of a finished sweep are those of the undisturbed one, and so are their tables."""
-    from styleexp.sweeps import manifest
+    from styleexp.experiments.sweeps import manifest
 
     jobs = manifest.read(folder)
     assert [job["state"] for job in jobs.values()] == ["done"] * JOBS
@@ -476,15 +477,15 @@ def kill_sweep(
 
 def _workers(folder: Path) -> list[int]:
     """Processes that are at a job of the sweep."""
-    from styleexp.reports import runs
-    from styleexp.sweeps import manifest
+    from styleexp.experiments.sweeps import manifest
+    from styleexp.runs import reading
 
     if not (folder / manifest.NAME).exists():
         return []
     return [
         job["process"]
         for name, job in manifest.read(folder).items()
-        if job["state"] == "running" and runs.read(folder / name)["status"] == "running"
+        if job["state"] == "running" and reading.read(folder / name)["status"] == "running"
     ]
 
 
@@ -580,7 +581,7 @@ def read_only(stage: Stage, chance: random.Random) -> str:
 
 def frozen_job(stage: Stage, chance: random.Random) -> str:
     """The folder of one job of a sweep can't be written; the others are done."""
-    from styleexp.sweeps import manifest
+    from styleexp.experiments.sweeps import manifest
 
     folder = stage.folder / "frozen-sweep"
     names = sorted(manifest.read(stage.swept))
@@ -741,8 +742,8 @@ def out_of_memory(stage: Stage, chance: random.Random) -> str:
 
 def out_of_memory_in_a_worker(stage: Stage, chance: random.Random) -> str:
     """One job of a sweep gets no memory: it fails, its neighbours are done."""
-    from styleexp.reports import runs
-    from styleexp.sweeps import manifest
+    from styleexp.experiments.sweeps import manifest
+    from styleexp.runs import reading
 
     limit = chance.randint(2500, 3500) << 20
     plan = PLAN + '  - name: greedy\n    overrides: ["views.resolution=2000", "views.count=8"]\n'
@@ -757,7 +758,7 @@ def out_of_memory_in_a_worker(stage: Stage, chance: random.Random) -> str:
     (failed,) = (name for name, state in states.items() if state == "failed")
     for name in states.keys() - {failed}:
         check_same(folder / name, stage.swept / name)
-    reason = str(runs.read(folder / failed)["reason"])
+    reason = str(reading.read(folder / failed)["reason"])
     shutil.rmtree(folder)
     return reason
 
@@ -889,7 +890,7 @@ def two_runs(stage: Stage, chance: random.Random) -> str:
 FETCH = """\
 import dataclasses, sys
 import pooch.core
-from styleexp import assets
+from styleexp.inputs import assets
 from styleexp.cli.assets import main
 pooch.core.time.sleep = lambda seconds: None
 known = assets.ASSETS["vgg19"]

@@ -14,7 +14,7 @@ TOOLS = Path(__file__).parent / "gltf_tools"
 
 def tools() -> str:
     """The program that runs them. Raises `UserError` where it or they aren't installed."""
-    from styleexp.errors import UserError
+    from styleexp.system.errors import UserError
 
     node = shutil.which("node")
     if node is None or not (TOOLS / "node_modules" / "gltf-validator").is_dir():

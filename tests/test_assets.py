@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 import torch
 
-from styleexp import assets
-from styleexp.assets import ASSETS, Asset
 from styleexp.cli.assets import main
 from styleexp.encoders import weights
-from styleexp.errors import UserError
+from styleexp.inputs import assets
+from styleexp.inputs.assets import ASSETS, Asset
+from styleexp.system.errors import UserError
 
 CHANNELS = 4
 rng = np.random.default_rng(0)
@@ -362,7 +362,7 @@ def test_two_processes_at_once(index, cache):
     code = textwrap.dedent(
         f"""
         import logging, sys
-        from styleexp import assets
+        from styleexp.inputs import assets
         from styleexp.encoders import weights
         logging.basicConfig(level="INFO")
         assets.ASSETS["tiny"] = {ASSETS["tiny"]!r}

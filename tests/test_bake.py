@@ -7,11 +7,12 @@ import pytest
 import warm
 from PIL import Image
 
-from styleexp import bake, meshes
 from styleexp.cli.bake import main
-from styleexp.compose import recorded
-from styleexp.meshes import load_mesh, vertex_normals
-from styleexp.origins import describe
+from styleexp.config.compose import recorded
+from styleexp.inputs import meshes
+from styleexp.inputs.meshes import load_mesh, vertex_normals
+from styleexp.runs import bake
+from styleexp.runs.origins import describe
 
 SIZE = 256
 
@@ -194,7 +195,7 @@ def test_exr_holds_the_displacement_itself(baked, tmp_path):
 
 
 def test_what_cannot_be_baked_is_said_in_one_sentence(tmp_path, capsys):
-    from styleexp import shapes
+    from styleexp.inputs import shapes
 
     def told(*arguments):
         assert main([str(each) for each in arguments]) == 2

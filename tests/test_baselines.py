@@ -11,15 +11,16 @@ import torch
 import warm
 
 import styleexp
-from styleexp import baselines, meshes, shapes
-from styleexp.baselines.face_gan import Critic, Generator, Patch, gradient_penalty
-from styleexp.baselines.geometric_textures import choose_patch, fit_exemplar
-from styleexp.baselines.pyramid import adjacency, pyramid, restrict, upsample
-from styleexp.baselines.specs import DisplacementMapConfig
-from styleexp.compose import compose
-from styleexp.errors import UserError
-from styleexp.fields import VertexField
-from styleexp.synthesis.method import Synthesis
+from styleexp.config.compose import compose
+from styleexp.inputs import meshes, shapes
+from styleexp.method import baselines
+from styleexp.method.baselines.face_gan import Critic, Generator, Patch, gradient_penalty
+from styleexp.method.baselines.geometric_textures import choose_patch, fit_exemplar
+from styleexp.method.baselines.pyramid import adjacency, pyramid, restrict, upsample
+from styleexp.method.baselines.specs import DisplacementMapConfig
+from styleexp.method.fields import VertexField
+from styleexp.method.synthesis.method import Synthesis
+from styleexp.system.errors import UserError
 
 SMOKE = ("profile=smoke", "encoder=vgg19_random")
 FOLDER = {"run.json", "status.json", "metrics.json", "preview.png", "turntable.gif", "result.ply",
@@ -45,7 +46,7 @@ def run(*overrides):
 
 def test_synthesis_is_the_default_and_without_a_baseline_the_method_is_the_papers():
     assert isinstance(baselines.method(compose([])), Synthesis)
-    assert baselines.method(compose(["method=robust"])) is sys.modules["styleexp.stylize"]
+    assert baselines.method(compose(["method=robust"])) is sys.modules["styleexp.api"]
 
 
 def test_a_baseline_from_python(tmp_path):
@@ -57,7 +58,7 @@ def test_a_baseline_from_python(tmp_path):
 
 PLUGIN = """
     from dataclasses import dataclass
-    from styleexp.registry import Spec
+    from styleexp.plugins.spec import Spec
 
     @dataclass
     class Config:
@@ -65,7 +66,7 @@ PLUGIN = """
         amount: float = 0.1
 
     def build(options):
-        from styleexp.scene import load
+        from styleexp.method.scene import load
         from styleexp.stylize import Result
 
         class Inflate:
@@ -186,7 +187,7 @@ def test_displacement_map_of_a_picture_raises_what_is_bright():
     ramp[:32] = 1.0
     from dataclasses import replace
 
-    from styleexp.pictures import picture_height
+    from styleexp.method.pictures import picture_height
 
     config = compose(["source=sphere", "style=bubble", "method=displacement_map"])
     method = baselines.method(config)
@@ -464,7 +465,7 @@ def test_text2mesh_runs_with_a_picture_and_lowers_its_loss(clip, tmp_path):
 
 
 def test_clip_loss_compares_directions():
-    from styleexp.losses import ClipLoss
+    from styleexp.method.losses import ClipLoss
 
     loss = object.__new__(ClipLoss)
     east, north = torch.tensor([2.0, 0.0]), torch.tensor([0.0, 3.0])

@@ -8,14 +8,14 @@ import pytest
 import torch
 from conftest import available
 
-from styleexp import meshes, shapes
-from styleexp.bench import convergence, render, step
-from styleexp.bench.floor import convolutions, operations
-from styleexp.bench.measuring import interleaved
-from styleexp.bench.parts import Parts
 from styleexp.cli.bench import main
 from styleexp.encoders import load_encoder
-from styleexp.errors import UserError
+from styleexp.experiments.bench import convergence, render, step
+from styleexp.experiments.bench.floor import convolutions, operations
+from styleexp.experiments.bench.measuring import interleaved
+from styleexp.experiments.bench.parts import Parts
+from styleexp.inputs import meshes, shapes
+from styleexp.system.errors import UserError
 
 SMOKE = ["encoder=vgg19_random", "profile=smoke", "threads=1"]
 
@@ -58,7 +58,7 @@ def test_peak_memory_is_that_of_the_work():
     # In a process of its own: a test's may hold freed memory that the work would take first.
     code = """
 import torch
-from styleexp.bench.measuring import peak_memory_mb
+from styleexp.experiments.bench.measuring import peak_memory_mb
 nothing = peak_memory_mb(lambda: None)
 print(peak_memory_mb(lambda: torch.ones(64 << 20, dtype=torch.uint8)) - nothing)
 """
@@ -143,8 +143,8 @@ def test_a_steps_parts_sum_to_the_step(learned):
 
 
 def test_the_parts_do_not_change_the_result(learned):
-    from styleexp import baselines
-    from styleexp.compose import compose
+    from styleexp.config.compose import compose
+    from styleexp.method import baselines
 
     config = compose([*learned, "optim.steps=3"])
     method = baselines.method(config)

@@ -16,10 +16,11 @@ from conftest import available
 from PIL import Image
 
 import styleexp
-from styleexp import check_view, meshes, previews, shapes
-from styleexp.errors import UserError
+from styleexp.inputs import meshes, shapes
 from styleexp.renderers.moderngl_deferred import ModernGLDeferred
 from styleexp.renderers.soft_raster import SoftRaster
+from styleexp.runs import previews, pyrender_view
+from styleexp.system.errors import UserError
 
 ELEVATIONS, AZIMUTHS = [15.0, -30.0], [35.0, 190.0]
 SMOKE = ["source=torus", "style=bubble", "method=robust", "profile=smoke", "encoder=vgg19_random"]
@@ -101,8 +102,9 @@ def test_it_runs_in_a_process_of_its_own(any_platform, critter):
     assert np.array_equal(own, before)
     assert not {"pyrender", "OpenGL"} & set(sys.modules)
     code = (
-        "import sys, styleexp.check_view\n"
-        "print(sorted({'torch', 'styleexp.renderers', 'styleexp.previews'} & set(sys.modules)))"
+        "import sys, styleexp.runs.pyrender_view\n"
+        "heavy = {'torch', 'styleexp.renderers', 'styleexp.runs.previews'}\n"
+        "print(sorted(heavy & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
@@ -185,9 +187,9 @@ def test_disagreement_is_a_warning_and_in_the_record(any_platform, tmp_path):
 
 def finished():
     """The source itself, as the result of no steps."""
-    from styleexp.compose import compose
-    from styleexp.scene import prepare
-    from styleexp.stylize import finish, start
+    from styleexp.config.compose import compose
+    from styleexp.method.gram import finish, start
+    from styleexp.method.scene import prepare
 
     config = compose(["source=critter", *SMOKE[1:], "preview=pyrender"])
     with warnings.catch_warnings():
@@ -221,8 +223,8 @@ def test_mistakes(arguments, expected, tmp_path):
 
 
 def test_lights_come_from_where_they_are_said_to():
-    pose = check_view._towards(np.array([0.0, 0.0, 2.0]))
+    pose = pyrender_view._towards(np.array([0.0, 0.0, 2.0]))
     assert np.allclose(pose, np.eye(4))
-    turned = check_view._towards(np.array([1.0, 2.0, -1.0]))
+    turned = pyrender_view._towards(np.array([1.0, 2.0, -1.0]))
     assert np.allclose(turned[:3, :3].T @ turned[:3, :3], np.eye(3))
     assert np.allclose(turned[:3, 2], np.array([1, 2, -1]) / 6**0.5)

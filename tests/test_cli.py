@@ -250,7 +250,7 @@ def test_debug_shows_the_traceback(tmp_path):
 
 
 def test_works_from_an_empty_folder_with_relative_paths_and_odd_names(tmp_path):
-    from styleexp import meshes, shapes
+    from styleexp.inputs import meshes, shapes
 
     torus = shapes.make("torus", detail=800)
     meshes.save_mesh(torus, torus.vertices, tmp_path / "mein Käse=ring.ply")
@@ -323,7 +323,7 @@ def test_several_values_are_a_sweep_and_a_failed_job_does_not_stop_the_rest(tmp_
 
 
 def with_style(folder):
-    from styleexp import meshes, shapes
+    from styleexp.inputs import meshes, shapes
 
     style = shapes.make("stripe", detail=2000)
     meshes.save_mesh(style, style.vertices, folder / "there.ply")
@@ -453,17 +453,17 @@ def test_a_working_folder_that_is_gone(tmp_path):
 
 
 def test_long_stages_are_named_and_named_again(monkeypatch, capsys):
-    from styleexp import stages
+    from styleexp.system import progress
 
-    monkeypatch.setattr(stages, "FIRST", 0.2)
-    monkeypatch.setattr(stages, "AGAIN", 0.5)
-    with stages.announced():
-        stages.doing("reading")
+    monkeypatch.setattr(progress, "FIRST", 0.2)
+    monkeypatch.setattr(progress, "AGAIN", 0.5)
+    with progress.announced():
+        progress.doing("reading")
         time.sleep(2)
-        stages.doing("")
+        progress.doing("")
         time.sleep(1)
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "reading ..."
     assert lines[1].startswith("reading: ")
-    stages.doing("drawing", at_once=True)  # nobody listens
+    progress.doing("drawing", at_once=True)  # nobody listens
     assert capsys.readouterr().out == ""

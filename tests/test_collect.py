@@ -4,11 +4,11 @@ import json
 
 import pytest
 
-from styleexp import locks
-from styleexp.errors import UserError
-from styleexp.reports import collect
-from styleexp.reports.collect import write
-from styleexp.sweeps import manifest, objective
+from styleexp.experiments.reports import collect
+from styleexp.experiments.reports.collect import write
+from styleexp.experiments.sweeps import manifest, objective
+from styleexp.system import locks
+from styleexp.system.errors import UserError
 
 pytest.importorskip("pandas", reason="needs the extra report")
 

@@ -99,7 +99,7 @@ def test_pages_that_would_ask_the_network_are_found(hook, page, asks):
 def test_configuration_reference_has_every_key_with_its_meaning(hook):
     import dataclasses
 
-    from styleexp import config
+    from styleexp.config import schema
 
     page = hook.configuration()
 
@@ -112,7 +112,7 @@ def test_configuration_reference_has_every_key_with_its_meaning(hook):
                 yield prefix + field.name
 
     written = set(re.findall(r"^\| `([\w.]+)` \|", page, re.MULTILINE))
-    assert set(keys(config.Config)) <= written
+    assert set(keys(schema.Config)) <= written
     assert "| `optim.schedule` | `cosine` | `step`: multiply the rate" in page
     assert "One of `step`, `cosine`." in page
     assert "logger.mlflow.uri" in page
@@ -123,7 +123,7 @@ def test_links_into_the_repository_are_checked(hook):
     from mkdocs.exceptions import PluginError
 
     link = hook.repository_link
-    assert link("`x`", "../src/styleexp/fields.py", None, "a.md") == (
+    assert link("`x`", "../src/styleexp/method/fields.py", None, "a.md") == (
         "[`x`](reference/api/fields.md)"
     )
     assert link("`conf/layers`", "../conf/layers", None, "a.md") == "`conf/layers`"

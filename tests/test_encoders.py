@@ -11,9 +11,9 @@ import torch
 from torch.nn import functional
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from styleexp import assets
 from styleexp.encoders import ENCODERS, Encoder, fused, load_encoder, vgg, weights
-from styleexp.errors import UserError
+from styleexp.inputs import assets
+from styleexp.system.errors import UserError
 
 PAPER = [1, 3, 5, 9, 13]
 

@@ -12,12 +12,13 @@ import warm
 from omegaconf import OmegaConf
 from PIL import Image
 
-from styleexp import assets, config, meshes, shapes
-from styleexp.compose import compose
-from styleexp.sweeps import figure, report
-from styleexp.sweeps.figure import Shown, layout
-from styleexp.sweeps.jobs import Job, setting, varying
-from styleexp.sweeps.plan import experiment_jobs
+from styleexp.config import schema
+from styleexp.config.compose import compose
+from styleexp.experiments.sweeps import figure, report
+from styleexp.experiments.sweeps.figure import Shown, layout
+from styleexp.experiments.sweeps.jobs import Job, setting, varying
+from styleexp.experiments.sweeps.plan import experiment_jobs
+from styleexp.inputs import assets, meshes, shapes
 
 CONF = Path(__file__).parent.parent / "conf"
 EXPERIMENTS = sorted((CONF / "experiment").glob("*.yaml"))
@@ -76,7 +77,7 @@ def test_every_job_of_every_experiment_is_valid(path):
     methods = set()
     for overrides in jobs:
         made = compose([*overrides, "hydra.mode=RUN"])
-        config.check(made)
+        schema.check(made)
         methods.add(getattr(made.baseline, "name", "learned"))
     robust = compose([*jobs[0], "method=robust", "hydra.mode=RUN"])
     assert (robust.baseline, robust.source.refine) == (None, "none")
@@ -123,7 +124,7 @@ def test_a_method_sets_what_its_file_says_and_nothing_of_the_default(name):
 
 def test_robust_is_the_dataclasses_defaults():
     made = dict(flat(asdict(compose(["method=robust"]))))
-    default = dict(flat(asdict(config.Config())))
+    default = dict(flat(asdict(schema.Config())))
     sizes = dict(flat(OmegaConf.to_container(OmegaConf.load(CONF / "profile" / "standard.yaml"))))
     assert not {key for key in default if made.get(key) != default[key]} - sizes.keys()
 

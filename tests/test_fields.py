@@ -3,11 +3,11 @@ import math
 import pytest
 import torch
 
-from styleexp import meshes, shapes
-from styleexp.config import FieldConfig
-from styleexp.fields import DisplacementField, FourierFeatures, zero_mean
-from styleexp.geometry import Surface, unfolded
-from styleexp.metrics.shape import flipped_faces
+from styleexp.config.schema import FieldConfig
+from styleexp.experiments.metrics.shape import flipped_faces
+from styleexp.inputs import meshes, shapes
+from styleexp.method.fields import DisplacementField, FourierFeatures, zero_mean
+from styleexp.method.surface import Surface, unfolded
 
 
 def generator(seed=0):

@@ -8,10 +8,10 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import warm
 
-from styleexp import identity, locks
-from styleexp.reports import folders, runs
-from styleexp.sweeps import claim, manifest, report
-from styleexp.sweeps.jobs import Job, planned
+from styleexp.experiments.sweeps import claim, manifest, report
+from styleexp.experiments.sweeps.jobs import Job, planned
+from styleexp.runs import folders, identity, reading
+from styleexp.system import locks
 
 PAIRS = int(os.environ.get("STYLEEXP_PAIRS", "1"))
 """How often two sweeps are started at once; ``make stress`` does it twenty times."""
@@ -172,7 +172,7 @@ def test_another_sweep_is_refused_in_a_folder_that_one_held(swept):
 
 
 def test_a_sweep_is_refused_where_its_source_has_changed_since(tmp_path):
-    from styleexp import meshes, shapes
+    from styleexp.inputs import meshes, shapes
 
     asked = ("-m", "source.path=t.ply", "style=rail,bubble", *TINY, "hydra.sweep.dir=all")
     for name, code in (("torus", 0), ("sphere", 2)):
@@ -186,7 +186,7 @@ def test_a_sweep_is_refused_where_its_source_has_changed_since(tmp_path):
 
 
 def test_a_job_that_failed_for_want_of_a_file_is_tried_again(tmp_path):
-    from styleexp import meshes, shapes
+    from styleexp.inputs import meshes, shapes
 
     asked = ("-m", "source.path=t.ply", "style=rail,bubble", *TINY, "hydra.sweep.dir=all")
     assert styleexp(*asked, cwd=tmp_path).returncode == 2
@@ -243,7 +243,7 @@ def test_another_runs_folder_is_shown_as_what_it_is(exchanged):
 
 def test_a_collected_table_shows_it_so_too(exchanged):
     pytest.importorskip("pandas", reason="needs the extra report")
-    from styleexp.reports.collect import collect
+    from styleexp.experiments.reports.collect import collect
 
     frame = collect(exchanged)
     assert list(frame["status"]) == ["other", "done"]
@@ -269,7 +269,7 @@ def test_a_record_without_a_key_has_the_same_one(swept):
 
 def test_numbers_without_a_record_are_nobodys(exchanged):
     (exchanged / "0" / "run.json").unlink()
-    found = runs.of_job(planned(exchanged)[0])
+    found = reading.of_job(planned(exchanged)[0])
     assert (found["status"], found["loss"]) == ("unreadable", None)
     assert "no run.json" in found["reason"]
 
@@ -281,7 +281,7 @@ def test_a_plan_refuses_another_run_in_a_jobs_folder(swept, tmp_path):
 
     text = "profile: smoke\noverrides: [method=robust, encoder=vgg19_random]\nexperiments:\n"
     (tmp_path / "plan.yaml").write_text(text + "  - {name: a, pairs: [[torus, rail]]}\n")
-    from styleexp.sweeps import plan
+    from styleexp.experiments.sweeps import plan
 
     ((job,),) = plan.jobs(plan.read(tmp_path / "plan.yaml"), tmp_path / "out").values()
     shutil.copytree(swept[0] / "all" / "1", job.folder)
@@ -295,7 +295,7 @@ def test_a_plan_refuses_another_run_in_a_jobs_folder(swept, tmp_path):
 
 
 def test_the_manifest_counts_no_attempts_of_another_job(tmp_path):
-    from styleexp.sweeps.plan import Planned
+    from styleexp.experiments.sweeps.plan import Planned
 
     job = Planned("a/x", (), tmp_path / "a" / "x", "k1", "a")
     manifest.write(tmp_path, [job])
@@ -305,9 +305,9 @@ def test_the_manifest_counts_no_attempts_of_another_job(tmp_path):
 
 
 def test_a_job_does_not_replace_another_run(swept):
-    from styleexp.cli.run import run
-    from styleexp.compose import compose
-    from styleexp.errors import UserError
+    from styleexp.config.compose import compose
+    from styleexp.experiments.execute import run
+    from styleexp.system.errors import UserError
 
     folder = swept[0] / "all" / "1"
     before = {p: p.read_bytes() for p in folder.iterdir() if p.is_file()}

@@ -20,15 +20,15 @@ import pytest
 import torch
 from corpus import _whole, obj, picture
 
-from styleexp import meshes
-from styleexp.compose import compose
-from styleexp.config import Config, check
-from styleexp.errors import UserError
-from styleexp.explain import explain
-from styleexp.images import load_image
+from styleexp.config.schema import Config, check
+from styleexp.config.compose import compose
+from styleexp.config.explain import explain
+from styleexp.inputs import meshes
+from styleexp.inputs.images import load_image
+from styleexp.method.views import look_at, orbit
 from styleexp.renderers.base import Shading
 from styleexp.renderers.soft_raster import SoftRaster, contour, deferred
-from styleexp.views import look_at, orbit
+from styleexp.system.errors import UserError
 
 hypothesis = pytest.importorskip("hypothesis", reason="hypothesis is not installed")
 from hypothesis import HealthCheck, example, given, settings  # noqa: E402

@@ -15,9 +15,9 @@ from conftest import available
 from corpus import CUBE, F, V, glb, gltf_parts, picture
 from PIL import Image
 
-from styleexp import meshes
-from styleexp.errors import UserError
-from styleexp.meshes import accessors, gltf
+from styleexp.inputs import meshes
+from styleexp.inputs.meshes import accessors, gltf
+from styleexp.system.errors import UserError
 
 pytestmark = pytest.mark.usefixtures("valid_glbs")
 
@@ -577,7 +577,7 @@ def test_numbers_that_are_none(tmp_path):
 
 
 def test_the_pages_own_files_are_valid(tmp_path):
-    from styleexp.reports import glb as page
+    from styleexp.experiments.reports import glb as page
 
     available(gltf_readers.tools)
     for k, (values, bare) in enumerate([(None, False), (V[:, 0], False), (None, True)]):

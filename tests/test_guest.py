@@ -10,8 +10,8 @@ import pytest
 import trimesh
 
 import styleexp
-from styleexp import shapes
-from styleexp.errors import UserError
+from styleexp.inputs import shapes
+from styleexp.system.errors import UserError
 
 SMOKE = ("method=robust", "profile=smoke", "encoder=vgg19_random", "metrics.judge=none")
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -77,7 +77,7 @@ def test_a_hydra_application_finds_everything_as_it_left_it(tmp_path):
 def test_threads_hold_during_the_call(monkeypatch):
     import torch
 
-    from styleexp import height_maps
+    from styleexp.method import height_maps
 
     seen = []
     real = height_maps.displacement

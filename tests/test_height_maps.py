@@ -8,11 +8,12 @@ import torch
 from PIL import Image
 from trying import one_encoder
 
-from styleexp import height_maps, meshes, shapes
-from styleexp.compose import compose
-from styleexp.height_maps import HeightMap, mesh_patch, triplanar
-from styleexp.scene import prepare
-from styleexp.stylize import displace, start
+from styleexp.config.compose import compose
+from styleexp.inputs import meshes, shapes
+from styleexp.method import height_maps
+from styleexp.method.gram import displace, start
+from styleexp.method.height_maps import HeightMap, mesh_patch, triplanar
+from styleexp.method.scene import prepare
 
 SMALL = (
     "method=robust",

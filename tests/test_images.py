@@ -5,8 +5,8 @@ import pytest
 import torch
 from PIL import Image
 
-from styleexp.errors import UserError
-from styleexp.images import is_normal_map, load_image, luminance
+from styleexp.inputs.images import is_normal_map, load_image, luminance
+from styleexp.system.errors import UserError
 
 rng = np.random.default_rng(0)
 COLOUR = rng.integers(0, 256, (20, 30, 3), dtype=np.uint8)
@@ -373,7 +373,7 @@ def test_deep_colours_load_their_libraries_only_when_needed(tmp_path):
     Image.fromarray(COLOUR).save(tmp_path / "a.tiff")
     Image.fromarray(COLOUR).save(tmp_path / "a.png")
     code = (
-        "import sys; from styleexp.images import load_image\n"
+        "import sys; from styleexp.inputs.images import load_image\n"
         f"load_image({str(tmp_path / 'a.png')!r}); load_image({str(tmp_path / 'a.tiff')!r})\n"
         "assert not {'imagecodecs', 'tifffile'} & set(sys.modules)"
     )

@@ -9,11 +9,13 @@ import pytest
 import trimesh
 from PIL import Image
 
-from styleexp import compose, plugins, records
-from styleexp.cli import run as command
-from styleexp.errors import UserError
-from styleexp.identity import essence, job_key
-from styleexp.loggers import Loggers
+from styleexp import plugins
+from styleexp.config import compose
+from styleexp.experiments import execute as command
+from styleexp.runs import records
+from styleexp.runs.identity import essence, job_key
+from styleexp.runs.loggers import Loggers
+from styleexp.system.errors import UserError
 
 SMOKE = (
     "source=torus", "style=bubble", "method=robust", "profile=smoke", "encoder=vgg19_random",
@@ -22,7 +24,7 @@ SMOKE = (
 )  # fmt: skip
 LOGGER = """
 from dataclasses import dataclass
-from styleexp.registry import Spec
+from styleexp.plugins.spec import Spec
 
 @dataclass
 class Options:

@@ -4,10 +4,10 @@ import pytest
 import torch
 from torch.nn import functional
 
-from styleexp.config import LossConfig
+from styleexp.config.schema import LossConfig
 from styleexp.encoders import Encoder, load_encoder
-from styleexp.losses import UNDIVIDED, StyleLoss, gram_matrix, layer_mask, layer_masks
-from styleexp.viewer import Images
+from styleexp.method.losses import UNDIVIDED, StyleLoss, gram_matrix, layer_mask, layer_masks
+from styleexp.method.viewer import Images
 
 
 def test_gram_is_the_normalised_product_averaged_over_views():

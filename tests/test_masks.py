@@ -12,13 +12,15 @@ import warm
 from PIL import Image
 
 import styleexp
-from styleexp import identity, masks, meshes, origins, scene, sources
-from styleexp.compose import compose
-from styleexp.config import StyleConfig
-from styleexp.errors import UserError
-from styleexp.overrides import understood
-from styleexp.synthesis.method import directions
-from styleexp.synthesis.walk import Sheet
+from styleexp.config.schema import StyleConfig, sources
+from styleexp.config.compose import compose
+from styleexp.config.overrides import understood
+from styleexp.inputs import meshes
+from styleexp.method import masks, scene
+from styleexp.method.synthesis.method import directions
+from styleexp.method.synthesis.walk import Sheet
+from styleexp.runs import identity, origins
+from styleexp.system.errors import UserError
 
 MAP = ("method=displacement_map", "source.refine=none")
 CHEAP = ("method=synthesis", "baseline.bank=500", "source.refine=none")
@@ -123,7 +125,7 @@ def test_beyond_the_mask_no_bit_moves_and_within_it_the_mean_is_zero(options):
 
 
 def test_the_learned_field_keeps_within_the_mask():
-    from styleexp import stylize
+    from styleexp.method import gram
 
     config = compose(["source=sphere", "style=bubble", "style.mask=height:0.5..1"])
     subject = scene.load(config)
@@ -138,8 +140,8 @@ def test_the_learned_field_keeps_within_the_mask():
         def forward(self, points, precision=None):
             return 0.01 * torch.sin(9 * points[:, 0])
 
-    state = stylize.State(Field(), None)
-    moved = stylize.displace(full, state, torch.float32)
+    state = gram.State(Field(), None)
+    moved = gram.displace(full, state, torch.float32)
     assert (moved[subject.mask == 0] == 0).all()
     assert moved.abs().max() > 0.005
     assert abs(float((moved * subject.areas).sum())) < 1e-4

@@ -16,10 +16,10 @@ import pytest
 import trimesh
 from PIL import Image
 
-from styleexp import meshes
-from styleexp.errors import UserError
-from styleexp.meshes.obj import triangulate
-from styleexp.meshes.reading import READABLE
+from styleexp.inputs import meshes
+from styleexp.inputs.meshes.obj import triangulate
+from styleexp.inputs.meshes.reading import READABLE
+from styleexp.system.errors import UserError
 
 pytestmark = pytest.mark.usefixtures("valid_glbs")
 
@@ -96,7 +96,7 @@ def part_names(mesh):
 
 def test_import_is_cheap():
     code = (
-        "import sys, styleexp.meshes;"
+        "import sys, styleexp.inputs.meshes;"
         "assert not {'torch', 'trimesh', 'scipy', 'gpytoolbox'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -8,13 +8,15 @@ import pytest
 import torch
 from PIL import Image
 
-from styleexp import meshes, metrics, shapes
 from styleexp.cli.metrics import main
-from styleexp.compose import compose
-from styleexp.config import Config
-from styleexp.metrics import patches, shape, style, truth
-from styleexp.metrics.board import nearest
-from styleexp.scene import pattern_unit
+from styleexp.config.compose import compose
+from styleexp.config.schema import Config
+from styleexp.experiments import metrics
+from styleexp.experiments.metrics import shape, style, truth
+from styleexp.experiments.metrics.board import nearest
+from styleexp.inputs import meshes, shapes
+from styleexp.method import patches
+from styleexp.method.scene import pattern_unit
 
 DETAIL = 6_000
 
@@ -296,7 +298,7 @@ def test_of_a_board_the_nearest_style_of_the_same_kind_is_named():
 @pytest.fixture(scope="module")
 def board(tmp_path_factory):
     """Two finished runs of coarse meshes, and one that failed."""
-    from styleexp.cli.run import run
+    from styleexp.experiments.execute import run
 
     folder = tmp_path_factory.mktemp("board")
     for name, detail in (("torus", 2000), ("bubble", 5000), ("stripe", 5000)):

@@ -14,12 +14,12 @@ import warm
 from torch import Tensor
 
 from styleexp import testing
-from styleexp.errors import UserError
+from styleexp.method.views import orbit
 from styleexp.renderers import llvm
 from styleexp.renderers.base import RenderOutput, Shading
 from styleexp.renderers.mitsuba_ad import MitsubaAD
 from styleexp.renderers.soft_raster import SoftRaster
-from styleexp.views import orbit
+from styleexp.system.errors import UserError
 
 for package in ("mitsuba", "drjit"):
     if importlib.util.find_spec(package) is None:
@@ -66,8 +66,8 @@ def test_agrees_with_soft_raster(named_mesh, name: str, normals: str, outlines: 
     The soft pictures differ where soft_raster looks at pixel centres and Mitsuba averages: faces
     smaller than a pixel, if they are flat, and outlines. The hard ones are equal.
     """
-    from styleexp.meshes import load_mesh
-    from styleexp.scene import normalised
+    from styleexp.inputs.meshes import load_mesh
+    from styleexp.method.scene import normalised
 
     surface = normalised(load_mesh(named_mesh(name)), torch.device("cpu"))[1]
     cameras = orbit(torch.tensor([0.1, -0.4]), torch.tensor([0.4, 2.5]), 2.0, 60.0)

@@ -14,13 +14,14 @@ from conftest import available
 from torch import Tensor
 
 import styleexp
-from styleexp import meshes, shapes, testing
-from styleexp.errors import UserError
+from styleexp import testing
+from styleexp.inputs import meshes, shapes
+from styleexp.method.views import orbit, zoom
 from styleexp.renderers import moderngl_deferred
 from styleexp.renderers.base import Cameras, RenderOutput, Shading
 from styleexp.renderers.moderngl_deferred import ModernGLDeferred
 from styleexp.renderers.soft_raster import SoftRaster
-from styleexp.views import orbit, zoom
+from styleexp.system.errors import UserError
 
 SMOKE = ["source=torus", "style=bubble", "method=robust", "profile=smoke", "encoder=vgg19_random"]
 
@@ -202,13 +203,13 @@ def test_a_forked_process_is_told(renderer):
 
 def test_a_lost_context_is_noticed(renderer):
     """pyrender ends EGL for the whole process: that must not go by unseen."""
-    available(lambda: __import__("styleexp.previews").previews.check_available("egl"))
+    available(lambda: __import__("styleexp.runs.previews").previews.check_available("egl"))
     code = """
 import os
 os.environ["PYOPENGL_PLATFORM"] = "egl"
 import torch
 from styleexp import testing
-from styleexp.errors import UserError
+from styleexp.system.errors import UserError
 from styleexp.renderers.base import Shading
 from styleexp.renderers.moderngl_deferred import ModernGLDeferred
 renderer, (vertices, faces) = ModernGLDeferred(), testing.icosphere(2)

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from styleexp.cli import run as command
-from styleexp.compose import compose
-from styleexp.config import check
-from styleexp.errors import UserError
-from styleexp.scene import prepare
-from styleexp.stylize import Diverged, blank, optimise, start
-from styleexp.viewer import Images
+from styleexp.config.compose import compose
+from styleexp.config.schema import check
+from styleexp.experiments import execute as command
+from styleexp.method.gram import Diverged, blank, optimise, start
+from styleexp.method.scene import prepare
+from styleexp.method.viewer import Images
+from styleexp.system.errors import UserError
 
 SMOKE = (
     "method=robust",
@@ -99,7 +99,7 @@ def test_an_exploding_loss_stops(scene):
 
 def test_the_command_names_the_last_good_checkpoint(tmp_path, monkeypatch):
     """Through the run itself: its error, its status, and a checkpoint that holds numbers."""
-    from styleexp.losses import StyleLoss
+    from styleexp.method.losses import StyleLoss
 
     real, calls = StyleLoss.distance, iter(range(100))
 

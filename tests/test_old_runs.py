@@ -7,16 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from styleexp import meshes, shapes
 from styleexp.cli.main import main as run_command
 from styleexp.cli.metrics import main as metrics_command
 from styleexp.cli.report import main as report_command
-from styleexp.cli.run import resume
 from styleexp.cli.sweep import main as sweep_command
-from styleexp.compose import compose, recorded
-from styleexp.errors import UserError
-from styleexp.layout import SCHEMA
-from styleexp.reports import folders, runs
+from styleexp.config.compose import compose, recorded
+from styleexp.experiments.execute import resume
+from styleexp.inputs import meshes, shapes
+from styleexp.runs import folders, reading
+from styleexp.runs.schema import SCHEMA
+from styleexp.system.errors import UserError
 
 OLD = json.loads((Path(__file__).parent / "old_runs.json").read_text())
 """What two commits wrote, by their hashes: the first that had run folders, and a later one."""
@@ -34,7 +34,7 @@ def old(tmp_path, monkeypatch):
         meshes.save_mesh(saved[name], saved[name].vertices, tmp_path / f"{name}.ply")
 
     def lay(commit, folder="old", **changed):
-        from styleexp.assets import sha256
+        from styleexp.inputs.assets import sha256
 
         at = tmp_path / folder
         at.mkdir(parents=True)
@@ -73,7 +73,7 @@ def test_pages_and_tables_read_them(commit, old, capsys, tmp_path):
     assert "bubble" in page
     assert "has layout" not in page
     assert report_command([str(tmp_path / "sweep")]) == 0
-    row = runs.read(at)
+    row = reading.read(at)
     steps = OLD[commit]["metrics.jsonl"]
     assert (row["status"], row["loss"]) == ("done", pytest.approx(steps[-1]["loss"]))
     assert row["config.field.sigma"] == OLD[commit]["run.json"]["config"]["field"]["sigma"]
@@ -84,7 +84,7 @@ def test_a_run_without_a_version_of_its_layout_is_of_the_first(old):
     record = json.loads((at / "run.json").read_text())
     del record["schema"]
     (at / "run.json").write_text(json.dumps(record))
-    assert runs.read(at)["status"] == "done"
+    assert reading.read(at)["status"] == "done"
     assert folders.read(at).problems == ()
 
 
@@ -136,13 +136,13 @@ def test_a_sweep_shows_the_others_beside_one_of_a_later_version(old, capsys, tmp
     at = old(LATER, "sweep/1", schema=SCHEMA + 1)
     assert report_command([str(tmp_path / "sweep")]) == 0
     assert "reads layouts up to" in (tmp_path / "sweep" / "report.html").read_text()
-    row = runs.read(at)
+    row = reading.read(at)
     assert row["status"] == "newer"
     assert "reads layouts up to" in row["reason"]
 
 
 def test_a_plan_does_not_touch_a_job_of_a_later_version(old, capsys, tmp_path):
-    from styleexp.sweeps import plan
+    from styleexp.experiments.sweeps import plan
 
     text = "profile: smoke\noverrides: [method=robust, encoder=vgg19_random]\nexperiments:\n"
     (tmp_path / "plan.yaml").write_text(text + "  - {name: a, pairs: [[torus, rail]]}\n")

@@ -10,8 +10,9 @@ import time
 import pytest
 import warm
 
-from styleexp import identity, meshes, origins, shapes
-from styleexp.errors import UserError
+from styleexp.inputs import meshes, shapes
+from styleexp.runs import identity, origins
+from styleexp.system.errors import UserError
 
 SMOKE = ["method=robust", "profile=smoke", "encoder=vgg19_random", "report=false", "threads=1",
          "preview.resolution=32", "preview.turntable_frames=1"]  # fmt: skip
@@ -159,7 +160,7 @@ def test_a_run_begun_where_hydra_changes_the_folder_has_its_own_source(tmp_path)
 def test_metrics_maps_and_pages_work_from_elsewhere(moved, capsys):
     from styleexp.cli.metrics import main as metrics
     from styleexp.cli.report import main as report
-    from styleexp.reports import shown
+    from styleexp.experiments.reports import shown
 
     assert metrics(["run", str(moved / "run"), "--judge", "none", "--json"]) == 0
     measured = json.loads(capsys.readouterr().out)
@@ -198,7 +199,7 @@ def test_metrics_maps_and_boards_refuse_another_source(change, moved, capsys):
 
 
 def test_a_board_tells_styles_of_one_name_apart(finished, tmp_path):
-    from styleexp.metrics.board import _style_name
+    from styleexp.experiments.metrics.board import _style_name
 
     one = {"config": {"style": {"path": "s.ply", "name": None}},
            "assets": {"style": {"sha256": "a" * 64}}}  # fmt: skip
@@ -212,8 +213,8 @@ def test_a_board_tells_styles_of_one_name_apart(finished, tmp_path):
 def test_a_figure_does_not_show_another_file_of_that_name(moved, tmp_path):
     from PIL import Image
 
-    from styleexp.sweeps import figure
-    from styleexp.sweeps.jobs import Job
+    from styleexp.experiments.sweeps import figure
+    from styleexp.experiments.sweeps.jobs import Job
 
     record = json.loads((moved / "run" / "run.json").read_text())
     job = Job("0", tuple(record["overrides"]), moved / "run", record["key"])
@@ -235,8 +236,8 @@ def test_a_record_names_every_file_that_was_read(finished):
 
 
 def test_weights_are_in_the_record(tmp_path, monkeypatch):
-    from styleexp import assets
-    from styleexp.compose import compose
+    from styleexp.config.compose import compose
+    from styleexp.inputs import assets
 
     (tmp_path / "w").write_bytes(b"weights")
     monkeypatch.setattr(assets, "locate", lambda name, kind: tmp_path / "w")
@@ -260,7 +261,7 @@ def test_a_gltf_is_known_by_its_buffers_too(tmp_path):
 
 def test_a_record_of_an_earlier_version_finds_its_file_by_its_content(tmp_path, monkeypatch):
     """Its path is relative: to the working folder, or the folder that the run's lies in."""
-    from styleexp.compose import compose
+    from styleexp.config.compose import compose
 
     save("torus", tmp_path / "t.ply")
     monkeypatch.chdir(tmp_path)
@@ -283,7 +284,7 @@ def test_a_record_of_an_earlier_version_finds_its_file_by_its_content(tmp_path, 
 
 
 def test_a_plan_goes_on_from_another_folder(tmp_path):
-    from styleexp.sweeps import manifest
+    from styleexp.experiments.sweeps import manifest
 
     save("torus", tmp_path / "t.ply")
     text = "profile: smoke\noverrides: [encoder=vgg19_random, method=displacement_map]\n"

@@ -13,10 +13,10 @@ from corpus import obj
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from styleexp import overrides
 from styleexp.cli import arguments
-from styleexp.compose import compose
-from styleexp.errors import UserError
+from styleexp.config import overrides
+from styleexp.config.compose import compose
+from styleexp.system.errors import UserError
 
 NAMES = (
     "my file (1).obj", "a=b.obj", "a,b.obj", "李明.obj", "Käse.obj", "part#2.obj",
@@ -90,7 +90,7 @@ def test_a_file_of_any_name_is_found(tmp_path_factory, text):
         config = compose([f"source.path={name}", "style=bubble"])
         assert config.source.path == name
         recorded = json.loads(json.dumps({"source": {"path": name, "name": None}}))
-        from styleexp.compose import recorded as read
+        from styleexp.config.compose import recorded as read
 
         assert read({**recorded, "style": {"name": "bubble"}}).source.path == name
     finally:

@@ -9,11 +9,11 @@ import pytest
 from PIL import Image
 
 import styleexp
-from styleexp import pictures, scene, sources
-from styleexp.compose import compose
-from styleexp.config import Config, StyleConfig
-from styleexp.errors import UserError
-from styleexp.height_maps import picture_side
+from styleexp.config.schema import Config, StyleConfig, sources
+from styleexp.config.compose import compose
+from styleexp.method import pictures, scene
+from styleexp.method.height_maps import picture_side
+from styleexp.system.errors import UserError
 
 MAP = ("method=displacement_map", "source.refine=none")
 SYNTHESIS = Config(baseline=True)  # anything but the method that compares with tone
@@ -93,7 +93,7 @@ def test_the_relief_is_as_deep_on_the_source_as_in_the_picture(kind, tmp_path):
 
 
 def test_synthesis_takes_the_same_heights():
-    from styleexp.synthesis.method import exemplar_of_style
+    from styleexp.method.synthesis.method import exemplar_of_style
 
     picture = grey(0.5 + 0.2 * np.sin(np.mgrid[0:64, 0:64][1] * (2 * np.pi / 16)))
     config = compose(

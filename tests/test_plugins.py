@@ -16,8 +16,8 @@ SMOKE = ["source=torus", "method=robust", "profile=smoke", "hydra.run.dir=run"]
 
 GOOD = """
     from dataclasses import dataclass
-    from styleexp.config import EncoderConfig, FieldConfig, LossConfig, StyleConfig
-    from styleexp.registry import Spec
+    from styleexp.config.schema import EncoderConfig, FieldConfig, LossConfig, StyleConfig
+    from styleexp.plugins.spec import Spec
 
     @dataclass
     class Renderer:
@@ -55,11 +55,11 @@ GOOD = """
         return np.broadcast_to(row[:, None, None], (96, 96, 3)).copy()
 
     def field(options, *, generator, sigma, bound):
-        from styleexp.fields import DisplacementField
+        from styleexp.method.fields import DisplacementField
         return DisplacementField(options, generator, sigma * options.gain, bound)
 
     def loss(options, *, encoder):
-        from styleexp.losses import StyleLoss
+        from styleexp.method.losses import StyleLoss
         class Powered(StyleLoss):
             def distance(self, *given):
                 return super().distance(*given) ** options.power
@@ -98,7 +98,7 @@ GOOD_POINTS = """
 
 WRONG = """
     from dataclasses import dataclass
-    from styleexp.registry import Spec
+    from styleexp.plugins.spec import Spec
     print("printed while it is imported")
 
     @dataclass
@@ -234,7 +234,7 @@ def test_plugins_are_listed_with_what_they_come_from(listed):
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
-        ("no_spec", "is of type dict, not styleexp.registry.Spec"),
+        ("no_spec", "is of type dict, not styleexp.plugins.spec.Spec"),
         ("other_name", "is named 'another', but its entry point is 'other_name'"),
         ("no_dataclass", "has a config that is not a dataclass"),
         ("nameless", "unexpected keyword argument 'name'|lacks the field 'name'"),

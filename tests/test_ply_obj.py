@@ -13,8 +13,8 @@ from corpus import F, V
 from corpus import ply as plain_ply
 from PIL import Image
 
-from styleexp import meshes
-from styleexp.errors import UserError
+from styleexp.inputs import meshes
+from styleexp.system.errors import UserError
 
 pytestmark = pytest.mark.usefixtures("valid_glbs")
 

@@ -10,10 +10,10 @@ import torch
 from trying import one_encoder
 
 import styleexp
-from styleexp import meshes, shapes
-from styleexp.compose import compose
-from styleexp.scene import load, prepare
-from styleexp.stylize import finish, optimise, start
+from styleexp.config.compose import compose
+from styleexp.inputs import meshes, shapes
+from styleexp.method.gram import finish, optimise, start
+from styleexp.method.scene import load, prepare
 
 NEAR = 0.05
 """Of the largest displacement, after three steps; 1e-4 and 1e-2 was measured. Another mesh is 1."""
@@ -155,7 +155,7 @@ def test_strength_zero_gives_the_source_back_exactly(torus, style, method, tmp_p
 
 def styleexp_run(*overrides):
     """Any method's result, the baselines' included."""
-    from styleexp import baselines
+    from styleexp.method import baselines
 
     config = compose([*FAST, *overrides])
     method = baselines.method(config)

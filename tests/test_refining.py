@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from styleexp import meshes
-from styleexp.compose import compose
-from styleexp.errors import UserError
-from styleexp.meshes import refining
+from styleexp.config.compose import compose
+from styleexp.inputs import meshes
+from styleexp.inputs.meshes import refining
+from styleexp.system.errors import UserError
 
 
 def as_trimesh(mesh):
@@ -116,7 +116,8 @@ def test_too_many_faces_are_refused(monkeypatch):
 
 
 def test_a_run_refines_for_its_style_and_says_so():
-    from styleexp import scene, sources
+    from styleexp.config import sources
+    from styleexp.method import scene
 
     sized = ["source=sphere", "style=scales", "style.scale=2"]
     plain = scene.load(compose([*sized, "source.refine=none"]))
@@ -129,7 +130,7 @@ def test_a_run_refines_for_its_style_and_says_so():
 
 
 def test_a_run_refines_to_a_number_of_faces():
-    from styleexp import scene
+    from styleexp.method import scene
 
     wanted = 60_000
     fine = scene.load(compose(["source=sphere", "style=scales", f"source.refine={wanted}"]))

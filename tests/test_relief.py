@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from styleexp import meshes, shapes
-from styleexp.relief import half_range, mesh_frequency, mesh_relief, picture_frequency
+from styleexp.inputs import meshes, shapes
+from styleexp.method.relief import half_range, mesh_frequency, mesh_relief, picture_frequency
 
 
 def measure(mesh):

@@ -1,9 +1,10 @@
 import pytest
 import torch
 
-from styleexp import meshes, remembered, shapes
-from styleexp.compose import compose
-from styleexp.scene import prepare
+from styleexp.config.compose import compose
+from styleexp.inputs import meshes, shapes
+from styleexp.method import gram_cache
+from styleexp.method.scene import prepare
 
 SMOKE = ["encoder=vgg19_random", "method=robust", "profile=smoke"]
 
@@ -17,9 +18,9 @@ def made(monkeypatch, tmp_path):
         mesh = shapes.make(name, 600)
         paths.append(tmp_path / f"{name}.obj")
         meshes.save_mesh(mesh, mesh.vertices, paths[-1])
-    write, written = remembered._write, []
+    write, written = gram_cache._write, []
     monkeypatch.setattr(
-        remembered, "_write", lambda path, found: written.append(path) or write(path, found)
+        gram_cache, "_write", lambda path, found: written.append(path) or write(path, found)
     )
 
     def make(*overrides):
@@ -73,7 +74,7 @@ def test_a_damaged_file_is_measured_anew(made, tmp_path, damage):
 
 
 def test_only_so_many_are_kept(made, monkeypatch, tmp_path):
-    monkeypatch.setattr(remembered, "KEPT", 3)
+    monkeypatch.setattr(gram_cache, "KEPT", 3)
     for seed in range(3):
         made(f"optim.seed={seed}")
     assert len(list((tmp_path / "cache" / "grams").iterdir())) == 3

@@ -10,11 +10,12 @@ import struct
 import numpy as np
 import pytest
 
-from styleexp import shapes
 from styleexp.cli.report import main
-from styleexp.errors import UserError
-from styleexp.meshes import load_mesh, save_mesh, vertex_normals
-from styleexp.reports import charts, folders, glb, html, page, shown, sweep_page
+from styleexp.experiments.reports import charts, glb, html, page, shown, sweep_page
+from styleexp.inputs import shapes
+from styleexp.inputs.meshes import load_mesh, save_mesh, vertex_normals
+from styleexp.runs import folders
+from styleexp.system.errors import UserError
 
 EVIL = '<img src=x onerror="alert(1)">'
 
@@ -110,8 +111,8 @@ def test_heat_map_runs_from_blue_over_white_to_red():
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """A run's folder as the command leaves it, with a wicked name."""
-    from styleexp.cli.run import run
-    from styleexp.compose import compose
+    from styleexp.config.compose import compose
+    from styleexp.experiments.execute import run
 
     folder = tmp_path_factory.mktemp("finished")
     torus = shapes.make("torus")
@@ -190,8 +191,8 @@ def test_page_from_the_folder_shows_the_same_meshes(finished):
 
 
 def test_no_page_where_none_is_wanted(tmp_path):
-    from styleexp.cli.run import run
-    from styleexp.compose import compose
+    from styleexp.config.compose import compose
+    from styleexp.experiments.execute import run
 
     overrides = [
         "style=bubble",
@@ -316,7 +317,7 @@ def test_grid_has_failed_and_missing_cells_and_seeds_share_one(sweep):
 def test_pictures_are_the_previews_own_views(tmp_path):
     from PIL import Image
 
-    from styleexp import previews
+    from styleexp.runs import previews
 
     shades = [
         [Image.new("L", (96, 96), 60 * row + 10 * view) for view in range(4)] for row in (0, 1, 2)
@@ -420,7 +421,7 @@ def test_help_loads_nothing_heavy():
 
 
 def test_study_refuses_pairs_that_cannot_be_shown_whole(sweep):
-    from styleexp.reports import study
+    from styleexp.experiments.reports import study
 
     with pytest.raises(UserError, match="can't be rated"):
         study.write(sweep)

@@ -27,7 +27,7 @@ def report(*arguments, cwd):
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     """A sweep of two pairs, with a job that fails, and a run of a mesh with a wicked name."""
-    from styleexp import meshes, shapes
+    from styleexp.inputs import meshes, shapes
 
     folder = tmp_path_factory.mktemp("runs")
     torus = shapes.make("torus", detail=2000)

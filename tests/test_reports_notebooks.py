@@ -7,13 +7,13 @@ import re
 import numpy as np
 import pytest
 
-from styleexp import shapes
 from styleexp.cli.report import main
-from styleexp.errors import UserError
-from styleexp.meshes import save_mesh, vertex_normals
+from styleexp.inputs import shapes
+from styleexp.inputs.meshes import save_mesh, vertex_normals
+from styleexp.system.errors import UserError
 
 pytest.importorskip("pandas", reason="pandas is not installed (extra report)")
-from styleexp.reports import notebook, notebooks
+from styleexp.experiments.reports import notebook, notebooks
 
 SMOOTH = {"silhouette_iou": 0.99, "spike": 2.0, "relief_rms": 0.01, "style_distance": 0.5}
 

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from styleexp.errors import UserError
-from styleexp.reports import study_results
-from styleexp.reports.reliability import krippendorff_alpha, mean_interval
+from styleexp.experiments.reports import study_results
+from styleexp.experiments.reports.reliability import krippendorff_alpha, mean_interval
+from styleexp.system.errors import UserError
 
 NAN = math.nan
 

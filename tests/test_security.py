@@ -13,8 +13,8 @@ import pytest
 import warm
 from trying import one_encoder
 
-from styleexp import compose, targets
-from styleexp.errors import UserError
+from styleexp.config import allow_list, compose
+from styleexp.system.errors import UserError
 
 ROOT = Path(__file__).parent.parent
 SOURCES = sorted((ROOT / "src").rglob("*.py"))
@@ -71,7 +71,7 @@ def test_what_a_configuration_would_call_is_named(kind):
     from omegaconf import OmegaConf
 
     with pytest.raises(UserError, match=r"victim\.run, which would run code"):
-        targets.check(OmegaConf.create(yaml.safe_load(EVIL[kind])))
+        allow_list.check(OmegaConf.create(yaml.safe_load(EVIL[kind])))
 
 
 @pytest.mark.parametrize("kind", ["callback", "logging"])
@@ -100,15 +100,15 @@ def test_our_own_targets_are_allowed():
     compose.register()
     with hydra.initialize_config_module("styleexp.conf", version_base="1.3"):
         config = hydra.compose("config", return_hydra_config=True, overrides=[])
-    targets.check(config)
-    found = {value for _, value in targets._named(OmegaConf.to_container(config.hydra))}
-    assert "styleexp.sweeps.report.OnSweep" in found
+    allow_list.check(config)
+    found = {value for _, value in allow_list._named(OmegaConf.to_container(config.hydra))}
+    assert "styleexp.experiments.sweeps.report.OnSweep" in found
 
 
 def test_a_runs_record_is_values_alone(tmp_path):
     from dataclasses import asdict
 
-    from styleexp.cli.run import resume
+    from styleexp.experiments.execute import resume
 
     record = {"schema": 1, "config": asdict(compose.compose(["source=torus", "style=bubble"]))}
     assert compose.recorded(record["config"]).source.name == "torus"
@@ -126,8 +126,9 @@ def test_a_page_of_a_strangers_run_shows_no_file_that_the_run_did_not_use(tmp_pa
     """run.json may name any mesh of ours; without its sha256 it is not put on the page."""
     from dataclasses import asdict
 
-    from styleexp import meshes, shapes
-    from styleexp.reports import folders, shown
+    from styleexp.experiments.reports import shown
+    from styleexp.inputs import meshes, shapes
+    from styleexp.runs import folders
 
     secret = tmp_path / "secret.ply"
     torus = shapes.make("torus", detail=300)
@@ -145,9 +146,9 @@ def test_a_page_of_a_strangers_run_shows_no_file_that_the_run_did_not_use(tmp_pa
 def test_a_checkpoint_with_a_pickle_inside_is_damaged_not_run(tmp_path):
     import pickle
 
-    from styleexp.records import RunFolder, read_record
-    from styleexp.scene import prepare
-    from styleexp.stylize import start
+    from styleexp.method.gram import start
+    from styleexp.method.scene import prepare
+    from styleexp.runs.records import RunFolder, read_record
 
     class Evil:
         def __reduce__(self):
@@ -188,7 +189,7 @@ def test_plugins_come_from_entry_points_or_the_variable_alone(tmp_path):
 def test_a_page_of_a_strangers_run_holds_its_texts_as_texts(tmp_path):
     """Wherever run.json and status.json may hold text; tests/test_reports_browser.py has a mesh of
     such a name in a real browser."""
-    from styleexp.reports import page
+    from styleexp.experiments.reports import page
 
     evil = "</script></code><script>window.ran=1</script><img src=x onerror=window.ran=1>"
     record = {

@@ -8,9 +8,9 @@ import sys
 import numpy as np
 import pytest
 
-from styleexp import meshes, shapes
-from styleexp.errors import UserError
-from styleexp.meshes.remeshing import unfit
+from styleexp.inputs import meshes, shapes
+from styleexp.inputs.meshes.remeshing import unfit
+from styleexp.system.errors import UserError
 
 
 @pytest.fixture(scope="module", params=shapes.names())
@@ -77,7 +77,7 @@ def test_made_again_it_is_the_same_even_in_another_process(shape):
 
 def test_critter_is_the_same_in_another_process():
     code = (
-        "import hashlib; from styleexp import shapes; m = shapes.make('critter', 3000);"
+        "import hashlib; from styleexp.inputs import shapes; m = shapes.make('critter', 3000);"
         "print(hashlib.sha256(m.vertices.tobytes() + m.faces.tobytes()).hexdigest())"
     )
     runs = {subprocess.check_output([sys.executable, "-c", code]) for _ in range(2)}

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd import gradcheck
 
 from styleexp import testing
-from styleexp.errors import UserError
+from styleexp.method.views import look_at
 from styleexp.renderers.base import Shading
 from styleexp.renderers.soft_raster import SoftRaster
 from styleexp.renderers.soft_raster.contour import (
@@ -33,7 +33,7 @@ from styleexp.renderers.soft_raster.shading import (
     PickOne,
     faces_seen,
 )
-from styleexp.views import look_at
+from styleexp.system.errors import UserError
 
 
 class HardRaster(SoftRaster):

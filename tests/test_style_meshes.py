@@ -7,10 +7,10 @@ import pytest
 import trimesh
 
 import styleexp
-from styleexp import meshes, shapes
-from styleexp.errors import UserError
-from styleexp.synthesis.exemplar import measure
-from styleexp.synthesis.shape import exemplar_of
+from styleexp.inputs import meshes, shapes
+from styleexp.method.synthesis.exemplar import measure
+from styleexp.method.synthesis.shape import exemplar_of
+from styleexp.system.errors import UserError
 
 CHEAP = ("method=synthesis", "metrics.judge=none", "baseline.bank=2000")
 

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from styleexp import styles
-from styleexp.config import StyleConfig
+from styleexp.config.schema import StyleConfig
+from styleexp.method import targets
 
 
 def blobs() -> torch.Tensor:
@@ -16,17 +16,17 @@ def blobs() -> torch.Tensor:
 
 
 def test_tone_has_the_contrast_and_mean_asked_for():
-    tone = styles.tone(blobs(), 0.4, StyleConfig(image_contrast=0.05))
+    tone = targets.tone(blobs(), 0.4, StyleConfig(image_contrast=0.05))
     assert tone.shape == (60, 60)
     assert float(tone.mean()) == pytest.approx(0.4, abs=1e-3)
     assert float(tone.std()) == pytest.approx(0.05, rel=1e-2)
-    own = styles.tone(blobs(), 0.4, StyleConfig(image_contrast=None, image_match_mean=False))
+    own = targets.tone(blobs(), 0.4, StyleConfig(image_contrast=None, image_match_mean=False))
     torch.testing.assert_close(own, blobs()[..., 0].clamp(0, 1))
 
 
 def test_windows_of_a_picture_show_it_at_the_density_asked_for():
     picture = torch.linspace(0, 1, 40).expand(40, 40)
-    seen = styles.picture_windows(picture, 80, 16, 5, torch.Generator().manual_seed(0))
+    seen = targets.picture_windows(picture, 80, 16, 5, torch.Generator().manual_seed(0))
     assert seen.image.shape == (5, 16, 16, 1)
     steps = (seen.image[:, 0, 1:, 0] - seen.image[:, 0, :-1, 0]).abs()
     assert float(steps.median()) == pytest.approx(1 / 80, rel=0.1)

@@ -9,11 +9,9 @@ import torch
 from PIL import Image
 
 import styleexp
-from styleexp.compose import compose
-from styleexp.config import OptimConfig
-from styleexp.errors import UserError
-from styleexp.scene import choose_device, prepare
-from styleexp.stylize import (
+from styleexp.config.compose import compose
+from styleexp.config.schema import OptimConfig
+from styleexp.method.gram import (
     finish,
     gradient_length,
     learning_rate,
@@ -21,6 +19,8 @@ from styleexp.stylize import (
     optimise,
     start,
 )
+from styleexp.method.scene import choose_device, prepare
+from styleexp.system.errors import UserError
 
 SMOKE = ("method=robust", "profile=smoke", "encoder=vgg19_random")
 pytestmark = pytest.mark.filterwarnings("ignore:the encoder 'vgg19_random'")
@@ -169,7 +169,7 @@ def test_result_is_in_the_sources_own_frame(tmp_path):
 
 
 def save_torus(path, scale, shift):
-    from styleexp import meshes, shapes
+    from styleexp.inputs import meshes, shapes
 
     torus = shapes.make("torus", detail=2000)
     meshes.save_mesh(torus, torus.vertices * scale + shift, path)

@@ -13,11 +13,11 @@ from contextlib import suppress
 import pytest
 import warm
 
-from styleexp import locks
-from styleexp.errors import UserError
-from styleexp.identity import job_key
-from styleexp.reports import runs
-from styleexp.sweeps import launchers, manifest, plan
+from styleexp.experiments.sweeps import launchers, manifest, plan
+from styleexp.runs import reading
+from styleexp.runs.identity import job_key
+from styleexp.system import locks
+from styleexp.system.errors import UserError
 
 KILLS = int(os.environ.get("STYLEEXP_KILLS", "2"))
 """How often the kill tests kill; ``make stress`` has ten."""
@@ -90,8 +90,8 @@ def test_seeds_multiply_unless_the_experiment_sweeps_them_itself(tmp_path):
 
 
 def test_the_key_is_of_what_the_result_follows_from(tmp_path, monkeypatch):
-    from styleexp import meshes, shapes
-    from styleexp.compose import compose
+    from styleexp.config.compose import compose
+    from styleexp.inputs import meshes, shapes
 
     torus = shapes.make("torus", detail=800)
     path = tmp_path / "ring.ply"
@@ -197,7 +197,7 @@ def test_what_is_done_is_not_done_again_and_a_changed_job_is(undisturbed, tmp_pa
 
 
 def test_a_failed_job_stays_failed_until_it_is_retried(tmp_path):
-    from styleexp import meshes, shapes
+    from styleexp.inputs import meshes, shapes
 
     text = "profile: smoke\noverrides: [method=robust, encoder=vgg19_random]\nexperiments:\n"
     text += '  - {name: a, overrides: [source=torus, style=rail, "style.path=null,ring.ply"]}\n'
@@ -213,7 +213,7 @@ def test_a_failed_job_stays_failed_until_it_is_retried(tmp_path):
     failed = next(
         path.parent
         for path in (tmp_path / "out").glob("a/*/status.json")
-        if runs.status(path.parent) == "failed"
+        if reading.status(path.parent) == "failed"
     )
     record = json.loads((failed / "status.json").read_text())
     (failed / "status.json").write_text(json.dumps({**record, "reason": "the disk was full"}))
@@ -285,7 +285,7 @@ def running(folder):
     return {
         name: job["process"]
         for name, job in manifest.read(folder).items()
-        if job["state"] == "running" and runs.read(folder / name)["status"] == "running"
+        if job["state"] == "running" and reading.read(folder / name)["status"] == "running"
     }
 
 
@@ -339,7 +339,7 @@ def test_a_preempted_job_is_requeued_and_resumes(undisturbed, tmp_path):
     victims = Victims(tmp_path, *arguments)
     try:
         runner = victims.start()
-        while not any(runs.steps(out / name) >= 3 for name in running(out)):
+        while not any(reading.steps(out / name) >= 3 for name in running(out)):
             assert runner.poll() is None, (tmp_path / "told.txt").read_text()
             time.sleep(0.02)
         ((name, process),) = running(out).items()
@@ -356,7 +356,7 @@ def test_a_preempted_job_is_requeued_and_resumes(undisturbed, tmp_path):
 DEADLY = """\
 import os, signal
 from dataclasses import dataclass
-from styleexp.registry import Spec
+from styleexp.plugins.spec import Spec
 
 @dataclass
 class Options:
@@ -392,8 +392,8 @@ def test_a_job_finds_nothing_of_the_one_before_it_in_its_process():
     import numpy as np
     import torch
 
-    from styleexp.compose import compose
-    from styleexp.process import _default_threads, prepare
+    from styleexp.config.compose import compose
+    from styleexp.system.process import _default_threads, prepare
 
     given = ("source=torus", "style=rail")
     default = _default_threads()
@@ -411,7 +411,7 @@ def test_jobs_side_by_side_share_the_cores(monkeypatch):
     monkeypatch.setattr(launchers, "cores", lambda: 8)
 
     def threads(name, jobs=None):
-        from styleexp import compose
+        from styleexp.config import compose
 
         compose.register()
         with hydra.initialize_config_module("styleexp.conf", version_base="1.3"):
@@ -431,9 +431,9 @@ def test_jobs_side_by_side_share_the_cores(monkeypatch):
 
 def test_jobs_given_in_batches_are_all_done(undisturbed, tmp_path):
     """A launcher keeps what each of its jobs returned: of thousands, that fills the memory."""
-    code = (
-        "import sys; from styleexp.cli.sweep import main; from styleexp.sweeps import launchers; "
-    )
+    code = "import sys; from styleexp.cli.sweep import main; "
+    code += "from styleexp.experiments.sweeps import launchers; "
+
     code += "launchers.MANY = 3; sys.exit(main(sys.argv[1:]))"
     done = warm.run(
         "-c", code, write_plan(tmp_path), "--folder", "out", cwd=tmp_path, env=warm.coarse()
@@ -486,7 +486,7 @@ def test_what_slurm_is_asked_for(tmp_path):
 IDLE = """\
 import os, sys, time
 from joblib import Parallel, delayed
-from styleexp.sweeps import runner
+from styleexp.experiments.sweeps import runner
 
 def job(number):
     runner._end_with_runner()

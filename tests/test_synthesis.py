@@ -8,18 +8,19 @@ import torch
 import trimesh
 
 import styleexp
-from styleexp import meshes, scene, shapes
-from styleexp.compose import compose
-from styleexp.errors import UserError
-from styleexp.metrics.patches import relief_of_mesh
-from styleexp.synthesis.direction import FLOW, UP, direction_field, turned
-from styleexp.synthesis.exemplar import MeshExemplar, PictureExemplar, measure
-from styleexp.synthesis.method import relief_of
-from styleexp.synthesis.optimise import bank, matched
-from styleexp.synthesis.quilting import quilt
-from styleexp.synthesis.room import ball_radius
-from styleexp.synthesis.shape import exemplar_of
-from styleexp.synthesis.walk import Sheet
+from styleexp.config.compose import compose
+from styleexp.inputs import meshes, shapes
+from styleexp.method import scene
+from styleexp.method.patches import relief_of_mesh
+from styleexp.method.synthesis.direction import FLOW, UP, direction_field, turned
+from styleexp.method.synthesis.exemplar import MeshExemplar, PictureExemplar, measure
+from styleexp.method.synthesis.method import relief_of
+from styleexp.method.synthesis.optimise import bank, matched
+from styleexp.method.synthesis.quilting import quilt
+from styleexp.method.synthesis.room import ball_radius
+from styleexp.method.synthesis.shape import exemplar_of
+from styleexp.method.synthesis.walk import Sheet
+from styleexp.system.errors import UserError
 
 CHEAP = ("method=synthesis", "metrics.judge=none", "baseline.bank=2000", "source.refine=none")
 
@@ -106,7 +107,7 @@ def test_the_flow_does_not_depend_on_how_the_mesh_lies(ball):
     ],
 )  # fmt: skip
 def test_wavelength_and_direction_are_measured(style, shortest, longest, directed):
-    from styleexp.synthesis.method import DIRECTED
+    from styleexp.method.synthesis.method import DIRECTED
 
     relief = relief_of_mesh(shapes.make(style, detail=12_000))
     found = measure(

@@ -8,9 +8,11 @@ import warm
 from PIL import Image
 
 import styleexp
-from styleexp import baselines, meshes, scene, shapes, unread
-from styleexp.baselines.specs import BASELINES
-from styleexp.compose import compose
+from styleexp.config import unread
+from styleexp.config.compose import compose
+from styleexp.inputs import meshes, shapes
+from styleexp.method import baselines, scene
+from styleexp.method.baselines.specs import BASELINES
 
 LEARNS = "which neither renders nor learns: add method=robust to learn."
 OPTIONS = {

@@ -3,8 +3,8 @@ import math
 import pytest
 import torch
 
-from styleexp import views
-from styleexp.config import LocalViewsConfig, ViewsConfig
+from styleexp.config.schema import LocalViewsConfig, ViewsConfig
+from styleexp.method import views
 
 CPU = torch.device("cpu")
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from corpus import obj, ply, stl
 
-from styleexp import meshes
-from styleexp.compose import compose
-from styleexp.config import check
-from styleexp.errors import UserError
-from styleexp.meshes import precision
-from styleexp.sources import load_source
+from styleexp.config.compose import compose
+from styleexp.config.schema import check
+from styleexp.config.sources import load_source
+from styleexp.inputs import meshes
+from styleexp.inputs.meshes import precision
+from styleexp.system.errors import UserError
 
 
 def torus(columns=40, rows=20, radius=10.0, tube=4.0):

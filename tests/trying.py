@@ -26,7 +26,7 @@ OVERRIDES = (
 @functools.cache
 def _encoder(precision: str) -> Any:
     from styleexp import plugins
-    from styleexp.compose import compose
+    from styleexp.config.compose import compose
 
     options = compose([*OVERRIDES, f"encoder.precision={precision}"]).encoder
     return plugins.build("encoder", options, device="cpu", seed=0)
@@ -42,7 +42,7 @@ def one_encoder(precision: str = "auto") -> Iterator[None]:
     def build(kind: str, options: Any, **given: Any) -> Any:
         return _encoder(precision) if kind == "encoder" else real(kind, options, **given)
 
-    with mock.patch("styleexp.scene.build", build):
+    with mock.patch("styleexp.method.scene.build", build):
         yield
 
 
@@ -51,8 +51,8 @@ def _config(folder: Path) -> Any:
     """A configuration with a small style and a small source."""
     from PIL import Image
 
-    from styleexp import meshes, shapes
-    from styleexp.compose import compose
+    from styleexp.config.compose import compose
+    from styleexp.inputs import meshes, shapes
 
     config = compose(OVERRIDES)
     ball = shapes.make("sphere", detail=300)
@@ -68,9 +68,9 @@ def outcome(case: Case, folder: Path, shared: Path) -> tuple[str, str, Any]:
 
     ``folder`` is empty; ``shared`` keeps what all share. Only `UserError` counts as a refusal.
     """
-    from styleexp.errors import UserError
-    from styleexp.scene import prepare
-    from styleexp.stylize import finish, optimise, start
+    from styleexp.method.gram import finish, optimise, start
+    from styleexp.method.scene import prepare
+    from styleexp.system.errors import UserError
 
     config = copy.deepcopy(_config(shared))
     (config.style if case.style else config.source).path = str(case.write(folder))
@@ -104,7 +104,7 @@ def check(case: Case, folder: Path, shared: Path) -> tuple[str, str]:
         return found, said
     assert np.isfinite(result.vertices).all()
     if not case.style:
-        from styleexp.meshes import load_mesh
+        from styleexp.inputs.meshes import load_mesh
 
         source = result.scene.source
         counts = len(source.faces), len(source.vertices)

@@ -33,17 +33,19 @@ LOADED = (
     "styleexp.cli",  # first: it says how threads wait
     "antlr4", "gpytoolbox", "hydra._internal.hydra", "hydra.core.override_parser.overrides_parser",
     "imagecodecs", "jinja2", "PIL.Image", "PIL.GifImagePlugin", "PIL.ImageDraw", "PIL.ImageFont",
-    "PIL.PngImagePlugin", "rich.console", "rich.progress", "safetensors.torch", "scipy.interpolate",
-    "scipy.ndimage", "scipy.optimize", "scipy.sparse.csgraph", "scipy.sparse.linalg",
-    "scipy.spatial", "tifffile", "torch", "torch._dynamo", "trimesh",
+    "PIL.PngImagePlugin", "rich.console", "rich.progress", "safetensors.torch",
+    "scipy.interpolate", "scipy.ndimage", "scipy.optimize", "scipy.sparse.csgraph",
+    "scipy.sparse.linalg", "scipy.spatial", "tifffile", "torch", "torch._dynamo", "trimesh",
     "hydra._internal.core_plugins.basic_launcher", "hydra._internal.core_plugins.basic_sweeper",
-    "styleexp.agreement", "styleexp.baselines.face_gan", "styleexp.baselines.geometric_textures",
-    "styleexp.cli.bake", "styleexp.cli.main", "styleexp.cli.metrics", "styleexp.cli.report",
-    "styleexp.cli.run", "styleexp.cli.sweep", "styleexp.encoders.vgg", "styleexp.images",
-    "styleexp.metrics.board", "styleexp.reports.page", "styleexp.reports.sweep_page",
-    "styleexp.renderers.soft_raster", "styleexp.stylize", "styleexp.sweeps.figure",
-    "styleexp.sweeps.runner", "styleexp.synthesis.method", "styleexp.synthesis.optimise",
-    "styleexp.unread",
+    "styleexp.experiments.agreement", "styleexp.method.baselines.face_gan",
+    "styleexp.method.baselines.geometric_textures", "styleexp.cli.bake", "styleexp.cli.main",
+    "styleexp.cli.metrics", "styleexp.cli.report", "styleexp.experiments.execute",
+    "styleexp.cli.sweep", "styleexp.encoders.vgg", "styleexp.inputs.images",
+    "styleexp.experiments.metrics.board", "styleexp.experiments.reports.page",
+    "styleexp.experiments.reports.sweep_page", "styleexp.renderers.soft_raster", "styleexp.api",
+    "styleexp.experiments.sweeps.figure", "styleexp.experiments.sweeps.runner",
+    "styleexp.method.synthesis.method", "styleexp.method.synthesis.optimise",
+    "styleexp.config.unread",
 )  # fmt: skip
 """What nearly every run loads. Nothing that opens a display or looks at the environment for more
 than the number of threads: that is the forked process's own."""
@@ -296,7 +298,7 @@ def _become(asked: dict[str, Any]) -> None:
     if str(COARSE) in added:
         import sitecustomize
 
-        from styleexp import shapes
+        from styleexp.inputs import shapes
 
         sitecustomize.coarsen(shapes)
     sys.argv[:] = [asked["kind"], *asked["arguments"]]

@@ -18,23 +18,23 @@ PACKAGE = ROOT / "src" / "styleexp"
 
 API = {
     "The method": (
-        "stylize", "scene", "fields", "height_maps", "geometry", "views", "viewer", "losses", "styles", "relief", "config", "baselines", "baselines.geometric_textures",
+        "api", "method.gram", "method.scene", "method.fields", "method.height_maps", "method.surface", "method.views", "method.viewer", "method.losses", "method.targets", "method.relief", "config.schema", "method.baselines", "method.baselines.geometric_textures",
     ),
-    "Synthesis on the surface": ("synthesis", "synthesis.method", "synthesis.shape", "synthesis.exemplar",
-                                 "synthesis.direction", "synthesis.walk", "synthesis.optimise", "synthesis.room"),
-    "Meshes and pictures": ("meshes", "meshes.mesh", "meshes.reading", "meshes.writing",
-                            "meshes.remeshing", "meshes.refining", "meshes.memory", "meshes.welding", "meshes.joining", "meshes.precision",
-                            "meshes.gltf", "meshes.accessors", "meshes.gltf_writing", "meshes.gltf_making",
-                            "meshes.ply", "meshes.ply_meshes", "meshes.obj", "deep_images", "images", "shapes", "assets", "sources", "bake"),
+    "Synthesis on the surface": ("method.synthesis", "method.synthesis.method", "method.synthesis.shape", "method.synthesis.exemplar",
+                                 "method.synthesis.direction", "method.synthesis.walk", "method.synthesis.optimise", "method.synthesis.room"),
+    "Meshes and pictures": ("inputs.meshes", "inputs.meshes.mesh", "inputs.meshes.reading", "inputs.meshes.writing",
+                            "inputs.meshes.remeshing", "inputs.meshes.refining", "inputs.meshes.memory", "inputs.meshes.welding", "inputs.meshes.joining", "inputs.meshes.precision",
+                            "inputs.meshes.gltf", "inputs.meshes.accessors", "inputs.meshes.gltf_writing", "inputs.meshes.gltf_making",
+                            "inputs.meshes.ply", "inputs.meshes.ply_meshes", "inputs.meshes.obj", "inputs.deep_images", "inputs.images", "inputs.shapes", "inputs.assets", "config.sources", "runs.bake"),
     "Renderers": ("renderers.base", "renderers.soft_raster", "renderers.soft_raster.renderer",
                   "renderers.soft_raster.raster", "renderers.soft_raster.contour",
                   "renderers.soft_raster.shading", "renderers.soft_raster.deferred",
                   "renderers.mitsuba_ad", "renderers.moderngl_deferred", "testing"),
     "Encoders": ("encoders", "encoders.vgg", "encoders.fused", "encoders.clip", "encoders.weights"),
-    "Parts and plugins": ("registry", "plugins", "loggers", "errors"),
-    "Runs, metrics, reports": ("records", "identity", "origins", "metrics", "metrics.style", "metrics.shape",
-                               "metrics.truth", "reports", "reports.collect",
-                               "reports.reliability", "reports.study_results", "sweeps.claim", "sweeps.plan", "sweeps.runner", "agreement", "remembered", "bench.render", "bench.step"),
+    "Parts and plugins": ("plugins.spec", "plugins", "runs.loggers", "system.errors"),
+    "Runs, metrics, reports": ("runs.records", "runs.identity", "runs.origins", "experiments.metrics", "experiments.metrics.style", "experiments.metrics.shape",
+                               "experiments.metrics.truth", "experiments.reports", "experiments.reports.collect",
+                               "experiments.reports.reliability", "experiments.reports.study_results", "experiments.sweeps.claim", "experiments.sweeps.plan", "experiments.sweeps.runner", "experiments.agreement", "method.gram_cache", "experiments.bench.render", "experiments.bench.step"),
 }  # fmt: skip
 COMMANDS = ("styleexp-assets", "styleexp-bake", "styleexp-bench", "styleexp-metrics",
             "styleexp-plugins", "styleexp-report", "styleexp-report study", "styleexp-sweep")  # fmt: skip
@@ -93,7 +93,7 @@ def repository_link(text, target, anchor, page):
     return text if path.name in text.strip("`") or told in text else f"{text} (`{told}`)"
 
 
-def on_post_page(output, page, config):
+def on_post_page(output, page, schema):
     """Refuse a page that would ask another machine for something. The search's helper for file://,
     which the theme would load from elsewhere, is here."""
     output = output.replace(SHIM, relative(page.url) + "assets/iframe-worker.js")
@@ -131,27 +131,28 @@ def source(name):
 
 def configuration():
     """Every key, its default and its meaning, from the dataclasses."""
-    from styleexp import config, plugins
+    from styleexp import plugins
+    from styleexp.config import schema
 
-    module = source("config")
+    module = source("config.schema")
     out = [
         "# Configuration",
         "Every key of a run, as `styleexp KEY=VALUE` takes it, with the default of the schema. "
         "Presets (`method=`, `profile=`, `layers=`, …) set others: `method=synthesis`, which every "
         "run starts from, sets `baseline` and `source.refine=auto`. `styleexp --help` shows the "
         "values that a choice of them gives. This page is made from "
-        "`styleexp/config.py` and the options of the registered parts when the site is built.",
+        "`styleexp/config/schema.py` and the options of the registered parts when the site is built.",
     ]
     top = []
-    for field in dataclasses.fields(config.Config):
-        kind = getattr(config, f"{_camel(field.name)}Config", None)
+    for field in dataclasses.fields(schema.Config):
+        kind = getattr(schema, f"{_camel(field.name)}Config", None)
         if kind is None or field.name in ("baseline", "logger", "renderer"):
-            top.append(_row(module["Config"], field, field.name, config))
+            top.append(_row(module["Config"], field, field.name, schema))
     out += ["## The run itself", *_table(top)]
-    for field in dataclasses.fields(config.Config):
-        kind = getattr(config, f"{_camel(field.name)}Config", None)
+    for field in dataclasses.fields(schema.Config):
+        kind = getattr(schema, f"{_camel(field.name)}Config", None)
         if kind is not None:
-            out += _section(module, kind.__name__, field.name, config)
+            out += _section(module, kind.__name__, field.name, schema)
     out.append("## Options of parts")
     out.append(
         "What a part has beside its `name` and the keys above, written `KIND.KEY=VALUE` "
@@ -167,32 +168,32 @@ def configuration():
             prefix = f"{kind}.{spec.name}" if kind == "logger" else kind
             for field in dataclasses.fields(spec.config):
                 if field.name != "name" and field.name not in inherited:
-                    row = _row(owner[spec.config.__name__], field, f"{prefix}.{field.name}", config)
+                    row = _row(owner[spec.config.__name__], field, f"{prefix}.{field.name}", schema)
                     rows.append((f"`{spec.name}`", *row))
         if rows:
             out += [f"### {kind}", *_table(rows, ("name", "key", "default", "meaning"))]
     return "\n\n".join(out) + "\n"
 
 
-def _section(module, name, prefix, config):
+def _section(module, name, prefix):
     written = module[name]
     rows, nested = [], []
-    for field in dataclasses.fields(getattr(config, name)):
+    for field in dataclasses.fields(getattr(schema, name)):
         if field.name == "local":
-            nested = _section(module, "LocalViewsConfig", f"{prefix}.local", config)
+            nested = _section(module, "LocalViewsConfig", f"{prefix}.local", schema)
         else:
-            rows.append(_row(written, field, f"{prefix}.{field.name}", config))
+            rows.append(_row(written, field, f"{prefix}.{field.name}", schema))
     return [f"## {prefix}", _prose(written.docstring.value), *_table(rows), *nested]
 
 
-def _row(written, field, key, config):
+def _row(written, field, key, schema):
     attribute = written.members[field.name]
     told = [_prose(attribute.docstring.value)] if attribute.docstring else []
-    if key in config.CHOICES:
-        told.append("One of " + ", ".join(f"`{each}`" for each in config.CHOICES[key]) + ".")
-    elif key in config.BETWEEN:
-        told.append("From {} to {}.".format(*config.BETWEEN[key]))
-    elif key in config.POSITIVE:
+    if key in schema.CHOICES:
+        told.append("One of " + ", ".join(f"`{each}`" for each in schema.CHOICES[key]) + ".")
+    elif key in schema.BETWEEN:
+        told.append("From {} to {}.".format(*schema.BETWEEN[key]))
+    elif key in schema.POSITIVE:
         told.append("Above 0.")
     return f"`{key}`", f"`{_default(field)}`", " ".join(told)
 

@@ -9,25 +9,24 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from styleexp.errors import UserError as UserError
-    from styleexp.meshes import Mesh as Mesh
-    from styleexp.meshes import load_mesh as load_mesh
-    from styleexp.stylize import stylize as stylize
+    from styleexp.api import stylize as stylize
+    from styleexp.inputs.meshes import Mesh as Mesh
+    from styleexp.inputs.meshes import load_mesh as load_mesh
+    from styleexp.system.errors import UserError as UserError
 
 __version__ = "0.1.0"
 
 _HOMES = {
-    "load_mesh": "styleexp.meshes",
-    "Mesh": "styleexp.meshes",
-    "UserError": "styleexp.errors",
+    "load_mesh": "styleexp.inputs.meshes",
+    "Mesh": "styleexp.inputs.meshes",
+    "UserError": "styleexp.system.errors",
+    "stylize": "styleexp.api",
 }
 
 __all__ = ["Mesh", "UserError", "load_mesh", "stylize"]
 
 
 def __getattr__(name: str) -> object:
-    if name == "stylize":  # the function's module has its name and is callable in its stead
-        return importlib.import_module("styleexp.stylize")
     if name not in _HOMES:
         raise AttributeError(f"module 'styleexp' has no attribute '{name}'")
     return getattr(importlib.import_module(_HOMES[name]), name)

@@ -14,7 +14,7 @@ SOURCE, STYLE = 2_000, 5_000
 
 
 def coarsen(shapes):
-    """Have ``styleexp.shapes`` make coarse ones where nobody asks for a number of vertices."""
+    """Have ``inputs.shapes`` make coarse ones where nobody asks for a number of vertices."""
     make = shapes.make
 
     def make_coarse(name, detail=None):
@@ -27,7 +27,7 @@ class _Finder(importlib.abc.MetaPathFinder):
     """Coarsens the module when it is first imported."""
 
     def find_spec(self, name, path, target=None):
-        if name != "styleexp.shapes":
+        if name != "styleexp.inputs.shapes":
             return None
         sys.meta_path.remove(self)
         spec = importlib.util.find_spec(name)
@@ -41,5 +41,5 @@ class _Finder(importlib.abc.MetaPathFinder):
         return spec
 
 
-if "styleexp.shapes" not in sys.modules:
+if "styleexp.inputs.shapes" not in sys.modules:
     sys.meta_path.insert(0, _Finder())

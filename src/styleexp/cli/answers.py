@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 
-from styleexp.errors import UserError
+from styleexp.system.errors import UserError
 
 
 def answer(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
-from styleexp import overrides
-from styleexp.errors import UserError, unknown_name
+from styleexp.config import overrides
+from styleexp.system.errors import UserError, unknown_name
 
 MULTIRUN = ("-m", "--multirun")
 SWEPT = ("+experiment=", "experiment=", "+search=", "search=", "hydra.mode=MULTIRUN")

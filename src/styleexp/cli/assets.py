@@ -7,8 +7,8 @@ import json
 import sys
 from collections.abc import Sequence
 
-from styleexp import assets
-from styleexp.errors import UserError, unknown_name
+from styleexp.inputs import assets
+from styleexp.system.errors import UserError, unknown_name
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -8,8 +8,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from styleexp import atomic
-from styleexp.errors import UserError
+from styleexp.system import atomic
+from styleexp.system.errors import UserError
 
 DESCRIPTION = """\
 Bake the displacement of a finished run into a height map and a tangent-space normal map (OpenGL,
@@ -48,8 +48,8 @@ def bake(folder: Path, size: int, kind: str, out: Path | None = None) -> list[Pa
             raise UserError(
                 "--format exr needs OpenEXR: pip install 'styleexp[exr]', or use --format png."
             )
-    from styleexp import bake as baking
-    from styleexp.reports import shown
+    from styleexp.experiments.reports import shown
+    from styleexp.runs import bake as baking
 
     source, vertices, displacement = shown.read_moved(folder)
     maps = baking.bake(source, displacement, vertices, size)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from styleexp.cli.answers import answer
-from styleexp.errors import UserError
+from styleexp.system.errors import UserError
 
 FACES = "5000, 20000, 80000, 320000, 1280000"
 
@@ -103,9 +103,9 @@ def _numbers(text: str) -> list[int]:
 def _render(options: argparse.Namespace) -> dict[str, Any]:
     import torch
 
-    from styleexp.bench import render
-    from styleexp.bench.measuring import machine
-    from styleexp.scene import choose_device
+    from styleexp.experiments.bench import render
+    from styleexp.experiments.bench.measuring import machine
+    from styleexp.method.scene import choose_device
 
     if options.repeats < 1 or options.threads < 1:
         raise UserError("--repeats and --threads: give 1 or more.")
@@ -135,7 +135,7 @@ def _line(row: dict[str, Any]) -> str:
 
 
 def _step(options: argparse.Namespace) -> dict[str, Any]:
-    from styleexp.bench import step
+    from styleexp.experiments.bench import step
 
     if options.steps < 1:
         raise UserError("--steps: give 1 or more.")
@@ -143,7 +143,7 @@ def _step(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _convergence(options: argparse.Namespace) -> dict[str, Any]:
-    from styleexp.bench import convergence
+    from styleexp.experiments.bench import convergence
 
     if options.redraw is not None:
         return convergence.redraw(options.redraw, options.out or options.redraw.with_suffix(".png"))
@@ -159,8 +159,8 @@ def _checked(overrides: list[str]) -> list[str]:
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
-    from styleexp.compose import compose
-    from styleexp.explain import explain
+    from styleexp.config.compose import compose
+    from styleexp.config.explain import explain
 
     try:
         compose(overrides)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-    from styleexp.errors import UserError
+    from styleexp.system.errors import UserError
 
 DEBUG = "debug=true"
 USAGE = """\
@@ -31,7 +31,7 @@ styleexp --help lists all keys and choices, and styleexp-assets list all names.
 
 def main() -> None:
     """Entry point of the ``styleexp`` command."""
-    from styleexp.errors import UserError
+    from styleexp.system.errors import UserError
 
     warnings.showwarning = _show_warning  # type: ignore[assignment]
     for stream in (sys.stdout, sys.stderr):
@@ -50,7 +50,7 @@ def main() -> None:
 
 
 def _command(given: list[str]) -> None:
-    from styleexp.errors import UserError
+    from styleexp.system.errors import UserError
 
     try:
         os.getcwd()
@@ -82,11 +82,11 @@ def _hydra() -> None:
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
-    from styleexp import compose
-    from styleexp.errors import UserError
-    from styleexp.explain import explain, explain_plugin
-    from styleexp.records import first_line
-    from styleexp.sweeps import report
+    from styleexp.config import compose
+    from styleexp.config.explain import explain, explain_plugin
+    from styleexp.experiments.sweeps import report
+    from styleexp.runs.records import first_line
+    from styleexp.system.errors import UserError
 
     compose.register()
     _list_groups_once()
@@ -131,10 +131,10 @@ def _job(config: DictConfig) -> float | None:
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import OmegaConf
 
-    from styleexp import compose, unread
-    from styleexp.cli.run import run
-    from styleexp.errors import UserError
-    from styleexp.sweeps import launchers, objective
+    from styleexp.config import compose, unread
+    from styleexp.experiments.execute import run
+    from styleexp.experiments.sweeps import launchers, objective
+    from styleexp.system.errors import UserError
 
     runtime = HydraConfig.get()
     in_search = objective.LEAST_IOU in os.environ
@@ -200,8 +200,8 @@ def _list_groups_once() -> None:
 def _resume(folder: str, others: list[str]) -> None:
     from pathlib import Path
 
-    from styleexp.cli.run import resume
-    from styleexp.errors import UserError
+    from styleexp.experiments.execute import resume
+    from styleexp.system.errors import UserError
 
     if others:
         raise UserError(

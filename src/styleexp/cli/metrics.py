@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from styleexp.cli.answers import answer
-from styleexp.errors import UserError
+from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
-    from styleexp.metrics import Judge
+    from styleexp.experiments.metrics import Judge
 
 TRUTH_SOURCES = ("sphere", "torus", "critter")
 """Sources of the truth board, all analytic."""
@@ -92,7 +92,7 @@ JUDGE_HELP = "encoder used for judging (default: one that the run did not train 
 
 
 def _judge(options: argparse.Namespace, trained: str | None = None) -> Judge | None:
-    from styleexp.metrics import judge_name, load_judge
+    from styleexp.experiments.metrics import judge_name, load_judge
 
     if options.windows < 1:
         raise UserError(f"--windows {options.windows}: give 1 or more.")
@@ -100,18 +100,18 @@ def _judge(options: argparse.Namespace, trained: str | None = None) -> Judge | N
 
 
 def _run(options: argparse.Namespace) -> dict[str, Any]:
-    from styleexp import records
-    from styleexp.metrics.board import measure_run
+    from styleexp.experiments.metrics.board import measure_run
+    from styleexp.runs import records
 
     trained = records.read_record(options.folder, "measure")["config"]["encoder"]["name"]
     return measure_run(options.folder, _judge(options, trained))
 
 
 def _compare(options: argparse.Namespace) -> dict[str, Any]:
-    from styleexp.metrics import measure
-    from styleexp.metrics.board import read_result
-    from styleexp.sources import load_source, load_style
-    from styleexp.stylize import configure
+    from styleexp.api import configure
+    from styleexp.config.sources import load_source, load_style
+    from styleexp.experiments.metrics import measure
+    from styleexp.experiments.metrics.board import read_result
 
     if not options.result.is_file():
         raise UserError(f"there is no file '{options.result}': give the result's mesh file.")
@@ -122,7 +122,7 @@ def _compare(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _board(options: argparse.Namespace) -> dict[str, Any]:
-    from styleexp.metrics.board import measure_board
+    from styleexp.experiments.metrics.board import measure_board
 
     judge = _judge(options)
     if judge is None:
@@ -133,10 +133,10 @@ def _board(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _truth(options: argparse.Namespace) -> dict[str, Any]:
-    from styleexp import meshes, shapes
-    from styleexp.config import SourceConfig, StyleConfig
-    from styleexp.metrics import truth
-    from styleexp.sources import load_source, load_style
+    from styleexp.config.schema import SourceConfig, StyleConfig
+    from styleexp.config.sources import load_source, load_style
+    from styleexp.experiments.metrics import truth
+    from styleexp.inputs import meshes, shapes
 
     names = options.sources.split(",")
     sources = []

@@ -14,10 +14,9 @@ class Preflight(Callback):
         """Called by Hydra for a single run. Hydra swallows any exception except `SystemExit`."""
         from omegaconf import OmegaConf
 
-        from styleexp import compose, sources
-        from styleexp import config as schema
         from styleexp.cli.main import stop
-        from styleexp.errors import UserError
+        from styleexp.config import compose, schema, sources
+        from styleexp.system.errors import UserError
 
         try:
             ours = [key for key in config if key != "hydra"]  # its values aren't resolvable yet

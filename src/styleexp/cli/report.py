@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from styleexp.errors import UserError
+from styleexp.system.errors import UserError
 
 DESCRIPTION = """\
 Write one self-contained HTML page about a run, or about all runs below a folder, and print its
@@ -37,13 +37,14 @@ def report(given: list[str]) -> list[Path]:
     if not options.folder.is_dir():
         raise UserError(f"there is no folder '{options.folder}': give a run's or a sweep's folder.")
     if options.notebooks is not None:
-        from styleexp.reports import notebooks
+        from styleexp.experiments.reports import notebooks
 
         pages, left_out = notebooks.execute(options.folder, options.notebooks)
         for told in left_out:
             print(f"styleexp-report: {told}", file=sys.stderr)
         return pages
-    from styleexp.reports import folders, page, sweep_page
+    from styleexp.experiments.reports import page, sweep_page
+    from styleexp.runs import folders
 
     if folders.is_run(options.folder):
         written = page.rewrite(
@@ -62,7 +63,7 @@ def study(given: list[str]) -> list[Path]:
     """Write the study's page, or analyse its answers."""
     options = _study_parser().parse_args(given)
     if options.analyse:
-        from styleexp.reports import study_results
+        from styleexp.experiments.reports import study_results
 
         found = study_results.read(options.analyse)
         for told in found.left_out:
@@ -74,7 +75,7 @@ def study(given: list[str]) -> list[Path]:
         )
     if not options.folder.is_dir():
         raise UserError(f"there is no folder '{options.folder}': give one with finished runs.")
-    from styleexp.reports import study as study_page
+    from styleexp.experiments.reports import study as study_page
 
     return [study_page.write(options.folder, options.seed, options.title)]
 

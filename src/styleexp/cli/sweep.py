@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from styleexp.errors import UserError
+from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
-    from styleexp.sweeps.plan import Plan, Planned
+    from styleexp.experiments.sweeps.plan import Plan, Planned
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -43,7 +43,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Run or continue a plan of experiments: finished jobs are skipped, killed "
         "jobs are resumed. Any number of runners may share a folder.",
         epilog="styleexp-sweep status FOLDER shows every job; styleexp-sweep collect FOLDER writes "
-        "runs.csv and runs.parquet.",
+        "reading.csv and reading.parquet.",
     )
     parser.add_argument("plan", type=Path, metavar="PLAN", help="a plan file, see sweeps/")
     parser.add_argument(
@@ -64,8 +64,8 @@ def _run(options: argparse.Namespace) -> int:
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
-    from styleexp.explain import explain
-    from styleexp.sweeps import launchers, manifest, plan, runner
+    from styleexp.config.explain import explain
+    from styleexp.experiments.sweeps import launchers, manifest, plan, runner
 
     read = plan.read(options.plan)
     folder = options.folder or Path("outputs") / options.plan.stem
@@ -105,15 +105,15 @@ def _run(options: argparse.Namespace) -> int:
 
 def _report(read: Plan, by_entry: dict[str, list[Planned]], folder: Path) -> int:
     """Write tables and figures of every experiment; return the exit code."""
-    from styleexp.reports import runs
-    from styleexp.sweeps.report import report
+    from styleexp.experiments.sweeps.report import report
+    from styleexp.runs import reading
 
     for entry in read.experiments:
         assert entry.name is not None
         title = f"{entry.name} ({entry.figure})" if entry.figure else entry.name
         (folder / entry.name).mkdir(exist_ok=True)
         report(by_entry[entry.name], folder / entry.name, title)
-    states = [runs.of_job(job)["status"] for jobs in by_entry.values() for job in jobs]
+    states = [reading.of_job(job)["status"] for jobs in by_entry.values() for job in jobs]
     return 0 if set(states) == {"done"} else 2
 
 
@@ -121,7 +121,7 @@ def _show_commands(
     read: Plan, by_entry: dict[str, list[Planned]], overrides: Sequence[str]
 ) -> None:
     """Print the commands, with each experiment's figure and cost, and mark finished jobs."""
-    from styleexp.reports import runs
+    from styleexp.runs import reading
 
     given = [o.removeprefix("profile=") for o in overrides if o.startswith("profile=")]
     profile = given[-1] if given else read.profile
@@ -133,7 +133,7 @@ def _show_commands(
         total += minutes or 0
         print(f"# {entry.name}{f', {entry.figure}' if entry.figure else ''}: {cost}")
         for job in by_entry[entry.name]:
-            status = runs.of_job(job)["status"]
+            status = reading.of_job(job)["status"]
             note = "" if status == "missing" else f"  # {status}"
             note = "  # the same job as above" if job.name in seen else note
             seen.add(job.name)
@@ -145,9 +145,9 @@ def _status(folder: Path) -> int:
     from rich.console import Console
     from rich.table import Table
 
-    from styleexp.reports import runs
-    from styleexp.sweeps import manifest
-    from styleexp.sweeps.jobs import Job
+    from styleexp.experiments.sweeps import manifest
+    from styleexp.experiments.sweeps.jobs import Job
+    from styleexp.runs import reading
 
     jobs = manifest.read(folder)
     if not jobs:
@@ -159,14 +159,14 @@ def _status(folder: Path) -> int:
     reasons: list[str] = []
     for name, known in jobs.items():
         job = Job(name, tuple(known.get("overrides", ())), folder / name, known.get("key"))
-        run: dict[str, Any] = runs.of_job(job)
+        run: dict[str, Any] = reading.of_job(job)
         if run["reason"]:
             reasons.append(f"{name}: {run['reason']}")
         state = "outdated" if known["state"] == "outdated" else str(run["status"])
         state = "waiting" if state == "missing" else state
         counts[state] += 1
         seconds, total = run["seconds"], run.get("config.optim.steps")
-        taken = runs.steps(folder / name)
+        taken = reading.steps(folder / name)
         table.add_row(
             name,
             state,
@@ -185,7 +185,7 @@ def _status(folder: Path) -> int:
 
 
 def _collect(folder: Path) -> int:
-    from styleexp.reports.collect import collect, write
+    from styleexp.experiments.reports.collect import collect, write
 
     runs = collect(folder)
     for path in write(runs, folder):

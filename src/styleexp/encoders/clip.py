@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from styleexp.errors import UserError
+from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
     from jaxtyping import Float

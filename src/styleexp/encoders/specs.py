@@ -6,9 +6,9 @@ import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from styleexp.config import EncoderConfig
-from styleexp.errors import UserError
-from styleexp.registry import Spec
+from styleexp.config.schema import EncoderConfig
+from styleexp.plugins.spec import Spec
+from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
     import torch
@@ -22,8 +22,8 @@ NORMALISATIONS = ("weights", "paper")
 
 
 def _pretrained(config: EncoderConfig, *, device: str | torch.device, seed: int) -> Encoder:
-    from styleexp import assets
     from styleexp.encoders import vgg, weights
+    from styleexp.inputs import assets
 
     return vgg.build(
         config.name,

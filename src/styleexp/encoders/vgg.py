@@ -19,7 +19,7 @@ from styleexp.encoders.weights import (
     VGGWeights,
     layer_names,
 )
-from styleexp.errors import UserError, unknown_name
+from styleexp.system.errors import UserError, unknown_name
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from styleexp import atomic, digests
+from styleexp.system import atomic, digests
 
 FORMAT = "styleexp-vgg-1"
 IMAGENET_MEAN = (0.485, 0.456, 0.406)

@@ -14,7 +14,7 @@ import sys
 from functools import cache
 from pathlib import Path
 
-from styleexp.errors import UserError
+from styleexp.system.errors import UserError
 
 VARIANT = "llvm_ad_rgb"
 """Mitsuba variant: CPU, differentiable, three colour channels."""

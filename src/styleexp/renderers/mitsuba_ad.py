@@ -26,12 +26,12 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from styleexp.errors import UserError, unknown_name
 from styleexp.renderers import llvm
 from styleexp.renderers.base import Cameras, Capabilities, Renderer, RenderOutput, Shading
 from styleexp.renderers.soft_raster.geometry import FaceNormals, unit, vertex_normals
 from styleexp.renderers.soft_raster.raster import facing
 from styleexp.renderers.soft_raster.shading import world_light
+from styleexp.system.errors import UserError, unknown_name
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int

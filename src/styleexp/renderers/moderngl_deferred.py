@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from styleexp.errors import UserError
 from styleexp.renderers.soft_raster.deferred import DeferredRenderer, Projected
 from styleexp.renderers.soft_raster.raster import Visible
+from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
     from collections.abc import Callable

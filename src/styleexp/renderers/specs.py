@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from styleexp.registry import Spec
+from styleexp.plugins.spec import Spec
 
 if TYPE_CHECKING:
     from styleexp.renderers.base import Renderer

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from styleexp.registry import Spec
+from styleexp.plugins.spec import Spec
 
 
 @dataclass

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from styleexp.errors import unknown_name
 from styleexp.renderers.base import Cameras, Capabilities, Renderer, RenderOutput, Shading
 from styleexp.renderers.soft_raster.contour import (
     Compose,
@@ -23,6 +22,7 @@ from styleexp.renderers.soft_raster.contour import (
 from styleexp.renderers.soft_raster.geometry import FaceNormals, Project, pixel_projection
 from styleexp.renderers.soft_raster.raster import candidate_pairs, facing
 from styleexp.renderers.soft_raster.shading import FlatSurface, SmoothSurface, world_light
+from styleexp.system.errors import unknown_name
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int

@@ -1,0 +1,1 @@
+"""The configuration: its schema, and everything between typed words and a `schema.Config`."""

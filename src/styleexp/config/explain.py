@@ -1,0 +1,72 @@
+"""Translate Hydra and OmegaConf errors into one-sentence messages."""
+
+from __future__ import annotations
+
+import difflib
+import re
+
+UNKNOWN_CHOICE = r"Could not find '([\w/]+)/([^'/]+)'"
+"""Hydra's message for an unknown option name."""
+HYDRA_PLUGINS = {"hydra/launcher": "sweep", "hydra/sweeper": "search"}
+"""Config groups provided by Hydra plugins, and the extra that installs them."""
+
+
+def explain_plugin(error: BaseException) -> None:
+    """Raise the `UserError` of a chosen plugin that can't be used, if that caused ``error``."""
+    from styleexp import plugins
+
+    choice = re.search(UNKNOWN_CHOICE, str(error))
+    if choice and plugins.known(choice[1], choice[2]):
+        plugins.find(choice[1], choice[2])
+
+
+def explain(error: BaseException) -> str:
+    """Hydra's error as one or two sentences, with the closest known name."""
+    text = str(error)
+    while error.__cause__ is not None:  # Hydra wraps OmegaConf's, which says more
+        error = error.__cause__
+        text += f"\n{error}"
+    choice = re.search(UNKNOWN_CHOICE, text)
+    if choice:
+        from styleexp.system.errors import unknown_name
+
+        if choice[1] in HYDRA_PLUGINS:
+            extra = "ray" if choice[2] == "ray" else HYDRA_PLUGINS[choice[1]]
+            return (
+                f"Hydra's plugin '{choice[2]}' is not installed: pip install 'styleexp[{extra}]'."
+            )
+        return str(unknown_name(choice[1], choice[2], _options(choice[1])))
+    key = re.search(r"Key '(\w+)' (?:is )?not in", text)
+    if key:
+        from styleexp.config.schema import Config
+
+        known = _keys(Config)
+        near = difflib.get_close_matches(key[1], [k.split(".")[-1] for k in known], n=1)
+        full = [k for k in known if near and k.split(".")[-1] == near[0]]
+        hint = f"did you mean {' or '.join(full)}? " if full else ""
+        return f"there is no key '{key[1]}': {hint}'styleexp --help' lists the keys."
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    told = [x for x in lines if not x.startswith(("full_key", "object_type", "reference_type"))]
+    return ": ".join(dict.fromkeys(told)) or type(error).__name__
+
+
+def _options(group: str) -> list[str]:
+    from hydra._internal.config_loader_impl import ConfigLoaderImpl
+    from hydra._internal.utils import create_config_search_path
+
+    from styleexp.config import compose
+
+    loader = ConfigLoaderImpl(create_config_search_path(compose.CONFIG_PATH))
+    return loader.get_group_options(group)
+
+
+def _keys(schema: type, prefix: str = "") -> list[str]:
+    import dataclasses
+    import typing
+
+    found = []
+    for name, kind in typing.get_type_hints(schema).items():
+        found.append(prefix + name)
+        if dataclasses.is_dataclass(kind):
+            found += _keys(typing.cast(type, kind), f"{prefix}{name}.")
+    return found

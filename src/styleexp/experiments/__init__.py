@@ -1,0 +1,1 @@
+"""Execute runs, sweep over settings, measure, report and benchmark."""

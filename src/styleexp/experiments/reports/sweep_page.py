@@ -1,0 +1,224 @@
+"""The page of a sweep: a grid over the swept axes, a sortable table, and charts per axis."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from styleexp.experiments.reports import charts, html, page
+from styleexp.runs import folders
+from styleexp.runs.folders import Run
+from styleexp.system.errors import UserError
+
+NAME = "report.html"
+SEED = "optim.seed"
+"""Key of the seed; runs that differ only in it share a cell."""
+OMITTED = "not given"
+"""Axis value of a run without an override for it."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Runs with the same values on all axes; empty if none was planned."""
+
+    runs: list[Run] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """One sheet of the grid: rows and columns are the first two axes."""
+
+    title: str
+    """Values of the remaining axes."""
+    rows: list[tuple[str, list[Cell]]]
+    columns: list[str]
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Runs below one folder that form a sweep."""
+
+    name: str
+    runs: list[Run]
+    axes: dict[str, list[str]]
+    """Values of each swept key, in job order."""
+
+    def values(self, run: Run) -> tuple[str, ...]:
+        """A run's values on the axes."""
+        given = settings(run)
+        return tuple(given.get(key, OMITTED) for key in self.axes)
+
+    def seed_of(self, run: Run) -> str | None:
+        """A run's seed, if seeds are swept."""
+        return settings(run).get(SEED) if self.seeds else None
+
+    @property
+    def seeds(self) -> bool:
+        """Whether runs differ in their seeds."""
+        return len({settings(run).get(SEED) for run in self.runs}) > 1
+
+    def label(self, run: Run) -> str:
+        """Label that distinguishes a run from the others."""
+        told = [f"{k}={v}" for k, v in zip(self.axes, self.values(run), strict=True)]
+        seed = self.seed_of(run)
+        return ", ".join([*told, *([f"seed {seed}"] if seed else [])]) or run.folder.name
+
+    @property
+    def row_axis(self) -> str:
+        """Key of the grid's rows; empty for a single axis."""
+        return next(iter(self.axes)) if len(self.axes) > 1 else ""
+
+    @property
+    def column_axis(self) -> str:
+        """Key of the grid's columns."""
+        return list(self.axes)[1] if len(self.axes) > 1 else next(iter(self.axes), "")
+
+    @property
+    def grids(self) -> list[Grid]:
+        """One sheet per combination of the axes from the third on."""
+        cells: dict[tuple[str, ...], Cell] = {}
+        for run in self.runs:
+            cells.setdefault(self.values(run), Cell()).runs.append(run)
+        keys = list(self.axes)
+        rows = self.axes[keys[0]] if len(keys) > 1 else [""]
+        columns = self.axes[self.column_axis] if keys else [""]
+        sheets = []
+        for rest in itertools.product(*(self.axes[key] for key in keys[2:])):
+
+            def place(row: str, column: str, rest: tuple[str, ...] = rest) -> tuple[str, ...]:
+                return (row, column, *rest) if len(keys) > 1 else (column,) if keys else ()
+
+            body = [(r, [cells.get(place(r, c), Cell()) for c in columns]) for r in rows]
+            if any(cell.runs for _, line in body for cell in line):
+                title = ", ".join(f"{k}={v}" for k, v in zip(keys[2:], rest, strict=True))
+                sheets.append(Grid(title, body, columns))
+        return sheets
+
+
+def write(folder: Path, run_pages: bool = True) -> Path:
+    """Write the page of all runs below ``folder``; return its path.
+
+    Also writes missing pages of finished runs, unless ``run_pages`` is false. Raises `UserError` if
+    there is no run.
+    """
+    runs = folders.find(folder)
+    if not runs:
+        raise UserError(f"there is no run below '{folder}': give the folder of a run or a sweep.")
+    if run_pages:
+        for run in runs:
+            if run.state == "done" and not (run.folder / page.NAME).is_file():
+                page.rewrite(run.folder)
+    return html.save(folder / NAME, build(folder, runs))
+
+
+def build(folder: Path, runs: list[Run]) -> str:
+    """Render the page as HTML, with links relative to ``folder``."""
+    sweeps = split(folder, runs)
+    return html.render(
+        "sweep.html",
+        ["sweep.js"],
+        title=folder.resolve().name,
+        sweeps=sweeps,
+        states=_count(runs),
+        pictures={run.folder: _picture(run) for run in runs},
+        headlines={run.folder: headline(run) for run in runs},
+        links={run.folder: _link(run, folder) for run in runs},
+        measures={sweep.name: measures(sweep) for sweep in sweeps},
+        plots={sweep.name: plots(sweep) for sweep in sweeps},
+    )
+
+
+def split(folder: Path, runs: list[Run]) -> list[Sweep]:
+    """Group runs into sweeps by their parent folder."""
+    together: dict[Path, list[Run]] = {}
+    for run in runs:
+        together.setdefault(run.folder.parent, []).append(run)
+    sweeps = []
+    for parent, beside in together.items():
+        below = parent.relative_to(folder) if parent != folder.parent else Path()
+        sweeps.append(Sweep("" if below == Path() else str(below), beside, axes(beside)))
+    return sweeps
+
+
+def axes(runs: list[Run]) -> dict[str, list[str]]:
+    """Keys whose values differ between runs, with their values; numbers are sorted."""
+    given = [settings(run) for run in runs]
+    keys = dict.fromkeys(key for each in given for key in each if key != SEED)
+    found = {}
+    for key in keys:
+        values = list(dict.fromkeys(each.get(key, OMITTED) for each in given))
+        if len(values) > 1:
+            found[key] = sorted(values, key=float) if all(map(_is_number, values)) else values
+    return found
+
+
+def settings(run: Run) -> dict[str, str]:
+    """A run's overrides by key, without Hydra's prefixes and without ``hydra.*`` keys."""
+    pairs = (override.lstrip("+~").partition("=") for override in run.overrides)
+    return {key: value for key, _, value in pairs if not key.startswith("hydra")}
+
+
+def headline(run: Run) -> tuple[str, float] | None:
+    """The most informative metric of a run, shown below its picture."""
+    for name in ("style_distance", "loss"):
+        if name in run.summary:
+            return name, run.summary[name]
+    return None
+
+
+def measures(sweep: Sweep) -> list[str]:
+    """Names of all numbers that any run of the sweep has."""
+    first = [told[0] for run in sweep.runs if (told := headline(run))]
+    return list(dict.fromkeys([*first, *(name for run in sweep.runs for name in run.summary)]))
+
+
+def plots(sweep: Sweep) -> list[dict[str, Any]]:
+    """One chart per axis and number."""
+    made = []
+    for name in measures(sweep):
+        for number, (key, values) in enumerate(sweep.axes.items()):
+            groups = [
+                (
+                    value,
+                    [
+                        (sweep.label(run), run.summary[name])
+                        for run in sweep.runs
+                        if sweep.values(run)[number] == value and name in run.summary
+                    ],
+                )
+                for value in values
+            ]
+            chart = charts.dot_chart(f"{name} by {key}", key, groups)
+            if chart:
+                made.append({"measure": name, "chart": chart})
+    return made
+
+
+def _picture(run: Run) -> str | None:
+    seen = html.views(run.folder, 2) if run.state == "done" else []
+    return html.data_uri(seen[0], html.THUMBNAIL) if seen else None
+
+
+def _link(run: Run, folder: Path) -> str | None:
+    """Relative link from the sweep's page to the run's."""
+    from urllib.parse import quote
+
+    if not (run.folder / page.NAME).is_file():
+        return None
+    return quote(Path(os.path.relpath(run.folder / page.NAME, folder)).as_posix())
+
+
+def _count(runs: list[Run]) -> dict[str, int]:
+    states = [run.state for run in runs]
+    return {state: states.count(state) for state in dict.fromkeys(states)}
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

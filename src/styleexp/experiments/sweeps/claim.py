@@ -1,0 +1,181 @@
+"""Claim the folder of a run or sweep before Hydra writes the first file into it.
+
+A folder named by the time gets a suffix if it is taken, since two commands in the same second would
+share it. A folder named by the user is refused while another process uses it; a sweep's also if it
+contains results of other jobs.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from styleexp.config import unread
+from styleexp.config.overrides import quote
+from styleexp.experiments.sweeps.jobs import JOBS, Job, listed, product
+from styleexp.runs import reading
+from styleexp.runs.records import RunFolder
+from styleexp.system import locks
+from styleexp.system.errors import UserError
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+    from styleexp.config.schema import Config
+
+PATIENCE = 2.0
+"""Seconds to wait for a folder, because checking whether it is held locks it briefly."""
+
+
+def run(config: DictConfig) -> None:
+    """Claim the folder of a single run, and set it in ``config``.
+
+    Raises `UserError` if the user named the folder and another process is using it.
+    """
+    _claim(config, "run")
+
+
+def sweep(config: DictConfig) -> Path:
+    """Claim the folder of a sweep, record its jobs in ``jobs.json``, and return the folder.
+
+    Raises `UserError` like `run`, and if the folder contains results of other jobs.
+    """
+    folder = _claim(config, "sweep")
+    try:
+        configs: list[Config] = []
+        jobs = _jobs(config, folder, configs)
+        content: dict[str, Any] = {"search": _search(config)}
+        if jobs is not None:
+            content = {"jobs": [job.overrides for job in jobs], "keys": [job.key for job in jobs]}
+        _refuse_others(folder, jobs or (), content)
+    except BaseException:
+        locks.drop(folder)
+        raise
+    RunFolder(folder).write_json(JOBS, content)
+    if told := unread.note(configs, _given(config)):
+        print(f"note: {told}", flush=True)
+    return folder
+
+
+def _claim(config: DictConfig, kind: str) -> Path:
+    """Lock the folder ``hydra.KIND.dir``, or a sibling if it is taken and its name is arbitrary."""
+    from omegaconf import OmegaConf, open_dict, read_write
+
+    named = f"hydra.{kind}.dir"
+    folder = Path(OmegaConf.select(config, named))
+    raw = OmegaConf.to_container(config.hydra[kind], resolve=False)
+    assert isinstance(raw, dict)
+    given = any(each.lstrip("+").startswith(f"{named}=") for each in config.hydra.overrides.hydra)
+    if given or "${now:" not in str(raw["dir"]):
+        try:
+            locks.take(folder, PATIENCE)
+        except locks.Busy:
+            raise UserError(busy(folder, kind)) from None
+        return folder
+    fresh = _fresh(folder)
+    if fresh != folder:
+        with read_write(config.hydra), open_dict(config.hydra):
+            config.hydra[kind].dir = str(fresh)
+            # A sweep's jobs are composed again, with these.
+            config.hydra.overrides.hydra.append(f"{named}={quote(str(fresh))}")
+    return fresh
+
+
+def busy(folder: Path, kind: str = "run") -> str:
+    """Error message for a folder that another process holds."""
+    return (
+        f"another process is using '{folder}': wait for it, or choose another folder with "
+        f"hydra.{kind}.dir=FOLDER."
+    )
+
+
+def _fresh(folder: Path) -> Path:
+    """Create and lock an unused folder: this one, or the first free one with a number appended."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    for each in _names(folder):
+        with suppress(FileExistsError, locks.Busy):
+            each.mkdir()
+            locks.take(each)
+            return each
+    raise AssertionError("unreachable")
+
+
+def _names(folder: Path) -> Iterator[Path]:
+    yield folder
+    for number in itertools.count(2):
+        yield folder.with_name(f"{folder.name}_{number}")
+
+
+def _jobs(config: DictConfig, folder: Path, configs: list[Config]) -> list[Job] | None:
+    """The sweep's jobs with their keys; None if the sweeper generates them dynamically. Appends
+    their configurations to ``configs``."""
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.hydra_config import HydraConfig
+    from omegaconf import open_dict
+
+    from styleexp.config import compose
+    from styleexp.runs import identity
+
+    if "BasicSweeper" not in config.hydra.sweeper._target_:
+        return None
+    listed = product(config.hydra.sweeper.params, _given(config))
+    loader: Any = GlobalHydra.instance().config_loader()
+    jobs, before = [], HydraConfig.instance().cfg
+    for number, overrides in enumerate(listed):
+        key = None
+        # If composing fails, Hydra or the job itself reports the error.
+        with suppress(Exception):
+            composed = loader.load_sweep_config(config, list(overrides))
+            with open_dict(composed):
+                composed.hydra.job.id = composed.hydra.job.num = number
+                HydraConfig.instance().set_config(composed)
+                del composed["hydra"]
+            configs.append(compose.typed(composed))
+            key = identity.job_key(configs[-1])
+        jobs.append(Job(str(number), tuple(overrides), folder / str(number), key))
+    HydraConfig.instance().cfg = before
+    return jobs
+
+
+def _given(config: DictConfig) -> list[str]:
+    """The command's overrides in Hydra's grammar; resolving would lose an escaped "${" in a file's
+    name."""
+    from omegaconf import OmegaConf
+
+    given: Any = OmegaConf.to_container(config.hydra.overrides.task, resolve=False)
+    return given
+
+
+def _search(config: DictConfig) -> dict[str, Any]:
+    """Description of a search, whose jobs aren't known in advance."""
+    from omegaconf import OmegaConf
+
+    return {
+        "overrides": _given(config),
+        "sweeper": json.loads(
+            json.dumps(OmegaConf.to_container(config.hydra.sweeper, resolve=True), default=str)
+        ),
+    }
+
+
+def _refuse_others(folder: Path, jobs: Sequence[Job], content: dict[str, Any]) -> None:
+    """Raise `UserError` if a folder contains results of other jobs. Failed jobs may be
+    overwritten."""
+    told = "choose another folder with hydra.sweep.dir=FOLDER, or remove it."
+    before = listed(folder)
+    if before is not None:
+        asked = "jobs" if "jobs" in content else "search"
+        if before.get(asked) != json.loads(json.dumps(content[asked])):
+            raise UserError(f"'{folder}' contains another sweep: {told}")
+    for job in jobs:
+        found = reading.of_job(job)
+        if found["status"] == "newer":
+            raise UserError(f"cannot run in '{job.folder}': {found['reason']}")
+        if found["status"] == "other" and reading.status(job.folder) != "failed":
+            raise UserError(
+                f"'{job.folder}' doesn't belong to this sweep ({found['reason']}): {told}"
+            )

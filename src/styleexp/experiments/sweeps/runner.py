@@ -1,0 +1,256 @@
+"""Run a plan: launch unfinished jobs through a Hydra launcher until none is left.
+
+A job is claimed by the lock of its own folder, which its process holds until it ends. So any number
+of runners can work on one plan, on one machine or on several that share its folder. If a runner or
+worker is killed, its job is resumed from its checkpoint.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import threading
+import time
+import traceback
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import redirect_stderr, redirect_stdout, suppress
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from styleexp.config.overrides import quote
+from styleexp.experiments.sweeps import launchers, manifest
+from styleexp.experiments.sweeps.jobs import Job
+from styleexp.runs import reading, records
+from styleexp.system import locks
+from styleexp.system.errors import UserError
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+    from styleexp.experiments.sweeps.plan import Planned
+
+LOG = "log.txt"
+"""File in a job's folder with its output."""
+MOST_DEATHS = 3
+"""Number of times a job's process may die while running alone before the job counts as failed."""
+AT_WORK = threading.Lock()
+"""Held by this process while it runs a job."""
+POLL = 1.0
+"""Seconds between polls of jobs that other runners execute."""
+
+
+def run(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> None:
+    """Run all jobs that are neither done nor failed, and wait for those of other runners.
+
+    ``launcher`` are overrides of Hydra's own configuration, including ``launcher=...``. Raises
+    `UserError` if the launcher itself fails before any job started.
+    """
+    deaths: Counter[str] = Counter()
+    suspects: set[str] = set()
+    while True:
+        if not (folder / manifest.NAME).exists():  # the folder was removed meanwhile
+            manifest.write(folder, jobs)
+        states = {}
+        for job in jobs:
+            found = reading.of_job(job)
+            manifest.refuse_others(job, found)
+            states[job.name] = found["status"]
+            if states[job.name] not in manifest.ENDED and deaths[job.name] >= MOST_DEATHS:
+                _give_up(job, folder)
+                states[job.name] = "failed"
+        waiting = [job for job in jobs if states[job.name] not in (*manifest.ENDED, "running")]
+        if not waiting:
+            if "running" not in states.values():
+                return
+            time.sleep(POLL)
+            continue
+        # A dying worker may kill the others: retry dead jobs one at a time.
+        batch = [job for job in waiting if job.name not in suspects] or waiting[:1]
+        before = _progress(folder, batch)
+        error = _launch(batch, folder, launcher)
+        after = {job.name: reading.of_job(job)["status"] for job in batch}
+        died = [name for name, state in after.items() if state == "died"]
+        if error is not None and not set(after.values()) & set(manifest.ENDED):
+            # No progress: some job can't even write a status, for example for lack of space.
+            died = [name for name, state in after.items() if state != "running"]
+        if len(batch) == 1:
+            deaths.update(died)
+        suspects.update(died)
+        if error is None:
+            continue
+        if _progress(folder, batch) == before:
+            raise UserError(
+                f"the launcher failed before any job started ({records.first_line(error)}): see "
+                f"{folder} or try --launcher basic."
+            ) from error
+        print(f"styleexp-sweep: a worker failed ({records.first_line(error)}); continuing.")
+
+
+def retry(jobs: Sequence[Planned]) -> None:
+    """Mark failed jobs to run again, from their checkpoints if they have one."""
+    for job in jobs:
+        if reading.of_job(job)["status"] != "failed":
+            continue
+        with suppress(locks.Busy), locks.hold(job.folder):
+            again = "failed, to be retried"
+            records.RunFolder(job.folder).write_status("interrupted", reason=again)
+
+
+def _give_up(job: Planned, folder: Path) -> None:
+    reason = f"its process died {MOST_DEATHS} times without finishing: see {LOG}"
+    with suppress(OSError), locks.hold(job.folder, manifest.PATIENCE):
+        records.RunFolder(job.folder).write_status("failed", reason=reason)
+    manifest.update(folder, job.name, "failed")
+    print(f"{job.name}: failed: {reason}")
+
+
+def _progress(folder: Path, jobs: Sequence[Planned]) -> list[Any]:
+    known = manifest.read(folder)
+    return [known.get(job.name, {}).get("attempts") for job in jobs]
+
+
+def _launch(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> Exception | None:
+    """Run the jobs with Hydra's launcher; return the exception that it raised or that killed a
+    job."""
+    import hydra
+    from hydra._internal.callbacks import Callbacks
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.plugins import Plugins
+    from hydra.core.utils import JobStatus
+    from hydra.types import HydraContext, RunMode
+
+    with hydra.initialize_config_module("styleexp.conf", version_base="1.3"):
+        composed: Any = GlobalHydra.instance().hydra
+        config = composed.compose_config(
+            "config",
+            [f"hydra.sweep.dir={quote(str(folder))}", *launcher],
+            run_mode=RunMode.MULTIRUN,
+            from_shell=False,
+        )
+        started = Plugins.instance().instantiate_launcher(
+            hydra_context=HydraContext(composed.config_loader, Callbacks()),
+            task_function=task,
+            config=config,
+        )
+        threads = launchers.threads_each(config.hydra)
+        # Hydra composes every job with the launcher's own overrides, which need the launcher.
+        chosen = [each for each in launcher if each.startswith("launcher=")]
+        given = []
+        for job in jobs:
+            more = [*chosen, f"hydra.sweep.subdir={quote(job.name)}"]
+            if not any(each.startswith("threads=") for each in job.overrides):
+                more.append(f"threads={threads}")
+            given.append([*job.overrides, *more])
+        size = launchers.batch_size(config.hydra) or len(jobs)
+        for at in range(0, len(jobs), size):
+            try:
+                returned = started.launch(given[at : at + size], initial_job_idx=at)
+            except Exception as error:
+                _settle(jobs[at : at + size])
+                return error
+            for each in returned:
+                if each.status == JobStatus.FAILED:
+                    return each._return_value
+    return None
+
+
+def _settle(jobs: Sequence[Planned]) -> None:
+    """Wait for jobs that are still running after another one was killed."""
+    while any(reading.of_job(job)["status"] == "running" for job in jobs):
+        time.sleep(POLL)
+
+
+def task(config: DictConfig) -> None:
+    """Job function for the launcher, possibly called in another process.
+
+    Skips jobs that another runner executes or has finished meanwhile. Never raises if the job
+    fails.
+    """
+    from contextlib import chdir
+
+    from hydra.core.hydra_config import HydraConfig
+    from omegaconf import OmegaConf
+
+    from styleexp.config import compose
+
+    _end_with_runner()
+    runtime = HydraConfig.get()
+    root, folder = Path(runtime.sweep.dir), Path(runtime.runtime.output_dir)
+    name = str(runtime.sweep.subdir)
+    # Keep Hydra's grammar: resolving would lose an escaped "${" in a file's name.
+    given: Any = OmegaConf.to_container(runtime.overrides.task, resolve=False)
+    compose.register()
+    try:
+        with AT_WORK, locks.hold(folder), chdir(runtime.runtime.cwd):  # see hydra.job.chdir
+            # No key: the manifest was removed; the runner rewrites it.
+            key = manifest.read(root).get(name, {}).get("key")
+            job = Job(name, tuple(given), folder, key)
+            state = reading.of_job(job)["status"] if key else reading.status(folder)
+            if state not in (*manifest.ENDED, "other"):  # the runner rejects another run's folder
+                _work(config, root, job)
+    except locks.Busy:
+        return
+
+
+@cache
+def _end_with_runner() -> None:
+    """Exit a joblib worker after its job if its runner was killed; it would wait forever."""
+    if not multiprocessing.current_process().name.startswith("Loky"):
+        return
+    runner = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == runner:
+            time.sleep(POLL)
+        with AT_WORK:
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _work(config: DictConfig, root: Path, job: Job) -> None:
+    """Run a job whose lock is held, with its output redirected to its log."""
+    from styleexp.config import compose
+    from styleexp.experiments.execute import begin
+    from styleexp.runs import identity
+
+    name, folder = job.name, job.folder
+    begun = time.perf_counter()
+    manifest.update(root, name, "running")
+    code = 0
+    with (
+        open(folder / LOG, "a", buffering=1, encoding="utf-8") as log,
+        redirect_stdout(log),
+        redirect_stderr(log),
+    ):
+        try:
+            told = [each for each in job.overrides if not each.startswith("launcher=")]
+            typed = compose.typed(config)
+            if job.key not in (None, identity.job_key(typed)):
+                raise UserError(
+                    "its source or style file has changed since the plan was read: start the plan "
+                    "again."
+                )
+            code = begin(typed, folder, [*told, "hydra.mode=RUN"])
+        except UserError as error:
+            _failed(folder, str(error))
+            print(f"styleexp: {error}")
+        except Exception as error:
+            _failed(folder, records.first_line(error))
+            traceback.print_exc()
+    state = str(reading.status(folder))
+    listed = manifest.update(root, name, state)
+    done = sum(job["state"] == "done" for job in listed.values())
+    current = sum(job["state"] != "outdated" for job in listed.values())
+    took = time.perf_counter() - begun
+    print(f"{name}: {state} in {took:.0f} s ({done} of {current} done)", flush=True)
+    if code == 130:
+        raise KeyboardInterrupt
+
+
+def _failed(folder: Path, reason: str) -> None:
+    """Write a status if the run failed before it could."""
+    if reading.status(folder) != "failed":
+        records.RunFolder(folder).write_status("failed", reason=reason)

@@ -1,0 +1,1 @@
+"""Meshes and images: reading, writing, assets and analytic shapes."""

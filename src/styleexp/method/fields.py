@@ -1,0 +1,175 @@
+"""The position-encoded displacement field (Sec. 3.2, Eq. 1)."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import nn
+from torch.autograd.function import once_differentiable
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch import Tensor
+
+    from styleexp.config.schema import FieldConfig
+
+REMEMBERED = 1 << 25
+"""Maximum number of elements of a cached encoding, 128 MB."""
+
+
+class FourierFeatures(nn.Module):
+    """Random Fourier features, gamma(v) = [cos 2 pi B v, sin 2 pi B v] (Eq. 1).
+
+    B is (features, 3) with entries from N(0, sigma^2), frozen. Its rows are sorted by norm, so that
+    progressive opening goes from low to high frequencies.
+    """
+
+    frequencies: Tensor
+
+    def __init__(
+        self, features: int, sigma: float, include_input: bool, generator: torch.Generator
+    ):
+        super().__init__()
+        frequencies = torch.randn(features, 3, generator=generator) * sigma
+        order = frequencies.norm(dim=1).argsort()
+        self.register_buffer("frequencies", frequencies[order])
+        self.include_input = include_input
+        self.size = 2 * features + (3 if include_input else 0)
+        self._known: tuple[Any, Tensor, Tensor, Tensor] | None = None
+
+    def forward(
+        self, points: Float[Tensor, "vertices 3"], opened: float = 1.0
+    ) -> Float[Tensor, "vertices size"]:
+        """Encode points; ``opened`` in [0, 1] is the fraction of bands that pass."""
+        # A run encodes the same points in every step.
+        frequencies = self.frequencies
+        key = (id(points), points._version, id(frequencies), frequencies._version, opened)
+        if self._known is None or self._known[0] != key:
+            phase = 2 * math.pi * points @ frequencies.T
+            rows = frequencies.shape[0]
+            window = (opened * rows - torch.arange(rows, device=points.device)).clamp(0, 1)
+            bands = [phase.cos() * window, phase.sin() * window]
+            encoded = torch.cat([points, *bands] if self.include_input else bands, dim=1)
+            if points.requires_grad or encoded.numel() > REMEMBERED:
+                return encoded
+            # Kept references make sure that no other object gets their ids.
+            self._known = (key, points, frequencies, encoded)
+        return self._known[3]
+
+
+class DisplacementField(nn.Module):
+    """MLP that maps a position to its displacement along the normal, in (-bound, bound).
+
+    The last layer starts at zero, so that the generated mesh equals the source at step 0, unless
+    ``last_layer`` is ``random``. ``sigma`` is in cycles per radius of the normalised source,
+    ``bound`` in radii.
+
+    With ``zero_mean`` the mean over the vertices is subtracted before the ``limit``, too. No loss
+    constrains it, since the mean displacement is also subtracted; if it drifted, every vertex would
+    saturate at the limit and learning would stop.
+    """
+
+    def __init__(self, config: FieldConfig, generator: torch.Generator, sigma: float, bound: float):
+        super().__init__()
+        self.bound = bound
+        self.centred = config.zero_mean
+        self.encode = FourierFeatures(config.features, sigma, config.include_input, generator)
+        sizes = [self.encode.size] + [config.width] * (config.depth - 1) + [1]
+        linears = [nn.Linear(a, b) for a, b in itertools.pairwise(sizes)]
+        for layer in linears:  # torch's default initialisation, with our generator
+            span = 1 / math.sqrt(layer.in_features)
+            nn.init.uniform_(layer.weight, -span, span, generator=generator)
+            nn.init.uniform_(layer.bias, -span, span, generator=generator)
+        if config.last_layer == "zero":
+            nn.init.zeros_(linears[-1].weight)
+            nn.init.zeros_(linears[-1].bias)
+        self.limit = config.limit
+        self.hidden = nn.ModuleList(linears[:-1])
+        self.last = linears[-1]
+
+    def forward(
+        self, encoded: Float[Tensor, "vertices size"], precision: torch.dtype = torch.float32
+    ) -> Float[Tensor, " vertices"]:
+        """Displacement for each row of ``encode(points)``, in radii of the normalised source. Takes
+        all vertices at once.
+
+        Hidden layers run in ``precision``; the last one always runs in float32, because
+        neighbouring displacements differ by less than bfloat16 can resolve.
+        """
+        x = encoded.to(precision)
+        fused = x.device.type == "cpu" and torch.backends.mkldnn.is_available()
+        fused = fused and precision == torch.bfloat16
+        for layer in self.hidden:
+            assert isinstance(layer, nn.Linear)
+            weight, bias = layer.weight.to(precision), layer.bias.to(precision)
+            if fused:
+                x = _LinearRelu.apply(x, weight, bias)
+            else:
+                x = torch.relu(nn.functional.linear(x, weight, bias))
+        latent = self.last(x.float()).squeeze(-1)
+        latent = latent - latent.mean() if self.centred else latent
+        return self.bound * (torch.tanh(latent) if self.limit == "tanh" else latent.clamp(-1, 1))
+
+
+class _LinearRelu(torch.autograd.Function):
+    """Fused linear layer and ReLU: one memory pass forward, one saved array less backward."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        out = torch.ops.mkldnn._linear_pointwise(x, weight, bias, "relu", [], "")
+        ctx.save_for_backward(x, weight, out)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor, Tensor]:
+        x, weight, out = ctx.saved_tensors
+        grad = torch.ops.aten.threshold_backward(grad, out, 0)
+        into = grad @ weight if ctx.needs_input_grad[0] else None
+        return into, grad.t() @ x, grad.sum(0)
+
+
+class VertexField(nn.Module):
+    """A free displacement per vertex, in (-bound, bound): the field without the network.
+
+    Starts at zero. The number of vertices is set by the first call of ``encode``; create the
+    optimiser after it.
+    """
+
+    latent: nn.Parameter
+
+    def __init__(self, bound: float):
+        super().__init__()
+        self.bound = bound
+        self.latent = nn.UninitializedParameter()  # type: ignore[assignment]
+
+    def encode(
+        self, points: Float[Tensor, "vertices 3"], opened: float = 1.0
+    ) -> Float[Tensor, "vertices 3"]:
+        """Return the points unchanged; ``opened`` is ignored."""
+        if isinstance(self.latent, nn.UninitializedParameter):
+            self.latent.materialize((len(points),), device=points.device)
+            nn.init.zeros_(self.latent)
+        return points
+
+    def forward(
+        self, encoded: Float[Tensor, "vertices 3"], precision: torch.dtype = torch.float32
+    ) -> Float[Tensor, " vertices"]:
+        """Displacement per vertex, in radii of the normalised source."""
+        if len(encoded) != len(self.latent):
+            raise ValueError(
+                f"the field has {len(self.latent)} vertices, got {len(encoded)} points"
+            )
+        return self.bound * torch.tanh(self.latent)
+
+
+def zero_mean(
+    displacement: Float[Tensor, " vertices"], areas: Float[Tensor, " vertices"], bound: float
+) -> Float[Tensor, " vertices"]:
+    """Subtract the area-weighted mean, so that the mesh neither grows nor shrinks overall, and stay
+    within the bound."""
+    mean = (displacement * areas).sum() / areas.sum()
+    return (displacement - mean).clamp(-bound, bound)

@@ -1,0 +1,111 @@
+"""Cache of target Gram matrices, so that a run similar to an earlier one starts sooner.
+
+Measuring the style and the source takes as long as a dozen steps, and most runs of a study share
+it. Cache files are keyed by a digest of all inputs: meshes, options, weights, the code itself, the
+torch version, threads. Cached values are bit-identical to computed ones. If a file is missing or
+unreadable, the values are computed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from styleexp import plugins
+from styleexp.inputs import assets
+from styleexp.system import atomic, digests
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from styleexp.config.schema import Config
+    from styleexp.encoders import Encoder
+    from styleexp.method.losses import Grams
+
+KEPT = 40
+"""Maximum number of files, about 5 MB each; the least recently used are evicted."""
+
+
+def grams(
+    config: Config, encoder: Encoder, about: list[object], make: Callable[[], tuple[Grams, Grams]]
+) -> tuple[Grams, Grams]:
+    """Return ``make()``, cached on disk.
+
+    ``about`` holds its other inputs: tensors, or objects that ``repr`` distinguishes. Results that
+    involve plugins, whose code can't be hashed, are never cached.
+    """
+    parts = (("renderer", config.renderer), ("encoder", config.encoder), ("loss", config.loss))
+    own = all(plugins.find(kind, part.name).origin == plugins.OWN for kind, part in parts)
+    if not own or config.loss.name != "gram":
+        return make()
+    path = assets.cache_dir() / "grams" / f"{_digest(config, encoder, about)}.safetensors"
+    found = _read(path, encoder)
+    if found is None:
+        found = make()
+        _write(path, found)
+    return found
+
+
+def _digest(config: Config, encoder: Encoder, about: list[object]) -> str:
+    options = [config.views, config.shading, config.encoder, config.loss, config.renderer]
+    digest = hashlib.sha256(_code())
+    known = [*options, config.optim.seed, torch.__version__, torch.get_num_threads()]
+    known += [torch.backends.cpu.get_cpu_capability(), encoder.precision]
+    for item in [*known, *about, *encoder.state_dict().values()]:
+        if isinstance(item, torch.Tensor):
+            flat = item.detach().cpu().contiguous().flatten()
+            digest.update(f"{item.device} {item.dtype} {tuple(item.shape)}".encode())
+            digest.update(flat.view(torch.uint8).numpy().data)
+        else:
+            digest.update(f"{item!r};".encode())
+    return digest.hexdigest()[:32]
+
+
+@cache
+def _code() -> bytes:
+    """Digest of all modules of the package; a list of the relevant ones would need maintenance."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.digest()
+
+
+def _read(path: Path, encoder: Encoder) -> tuple[Grams, Grams] | None:
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as opened:
+            told = opened.metadata()["digest"]
+            tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+    except (OSError, SafetensorError, KeyError, TypeError):
+        return None
+    if digests.of(tensors) != told:
+        return None
+    with suppress(OSError):  # read-only cache
+        os.utime(path)
+    ordered = [(name, tensors[name].to(encoder.mean.device)) for name in sorted(tensors)]
+    whole, local = ([t for n, t in ordered if n.startswith(k)] for k in ("global", "local"))
+    return whole, local
+
+
+def _write(path: Path, found: tuple[Grams, Grams]) -> None:
+    from safetensors.torch import save
+
+    tensors: dict[str, Tensor] = {}
+    for kind, each in zip(("global", "local"), found, strict=True):
+        tensors |= {f"{kind}.{i:02d}": gram.contiguous().cpu() for i, gram in enumerate(each)}
+    content = save(tensors, {"digest": digests.of(tensors)})
+    with suppress(OSError):  # the cache is optional
+        path.parent.mkdir(parents=True, exist_ok=True)
+        atomic.sweep(path.parent, seconds=atomic.A_DAY)
+        atomic.write(path, atomic.data(content))
+        files = sorted(path.parent.glob("[!.]*.safetensors"), key=lambda p: p.stat().st_mtime)
+        for old in files[:-KEPT]:
+            old.unlink(missing_ok=True)

@@ -1,0 +1,218 @@
+"""Gram matrices and the style loss (Sec. 3.3.2 and 3.3.3, Eqs. 3-8), and Text2Mesh's loss for
+comparison."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch.autograd.function import once_differentiable
+from torch.nn import functional
+
+from styleexp.encoders import Encoder
+from styleexp.system.errors import UserError
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+    from torch import Tensor
+
+    from styleexp.config.schema import LossConfig
+    from styleexp.encoders.clip import ClipEncoder
+    from styleexp.method.viewer import Images
+
+Grams = list["Float[Tensor, 'channels channels']"]
+"""One Gram matrix per style layer, averaged over views."""
+
+
+UNDIVIDED = 1e6
+"""Common divisor of all Gram matrices with ``loss.normalisation=none``: it changes no ratio, and
+keeps the squares of gradients within float32."""
+
+
+def gram_matrix(
+    features: Float[Tensor, "views channels height width"],
+    mask: Bool[Tensor, "views height width"] | None = None,
+    normalisation: str = "channels_cells",
+) -> Float[Tensor, "channels channels"]:
+    """G = F^T F over all views, normalised as in ``LossConfig.normalisation``.
+
+    The paper's Eqs. 3-6 sum over views and add matrices of different layers; here this is read as
+    one Gram per layer, averaged over views. With a mask, only masked cells are summed and counted,
+    so the result doesn't depend on how much of the frame the object fills. An empty mask gives
+    zeros.
+    """
+    cells = features[:, 0].numel()
+    return mean_gram(_Gram.apply(features, mask), mask, cells, normalisation)
+
+
+def mean_gram(
+    total: Float[Tensor, "channels channels"],
+    mask: Bool[Tensor, "views height width"] | None,
+    cells: int,
+    normalisation: str = "channels_cells",
+) -> Float[Tensor, "channels channels"]:
+    """Normalise a sum of F^T F over the masked cells, as in ``LossConfig.normalisation``."""
+    if normalisation == "none":
+        return total / UNDIVIDED
+    count = cells if mask is None else mask.sum().clamp(min=1)
+    # Dividing by C before squaring turns the sum of C x C squares into their mean.
+    channels = {"cells": 1, "channels_cells": len(total), "mean": len(total) ** 2}[normalisation]
+    return total / (channels * count)
+
+
+class _Gram(torch.autograd.Function):
+    """Sum over views and masked cells. Its gradient F (D + D^T) takes one product; plain autograd,
+    unaware that both factors are equal, takes two and a masking."""
+
+    @staticmethod
+    def forward(ctx, features, mask):
+        views, channels, height, width = features.shape
+        cells = features.permute(0, 2, 3, 1).reshape(views, height * width, channels)
+        if mask is not None:
+            cells = cells * mask.reshape(views, height * width, 1).to(cells.dtype)
+        ctx.save_for_backward(cells)
+        ctx.cells = (height, width)
+        # Sum views in float32 (or better) to keep the rounding error small with bfloat16 features.
+        per_view = torch.bmm(cells.transpose(1, 2), cells)
+        return per_view.to(torch.promote_types(per_view.dtype, torch.float32)).sum(0)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad):
+        (cells,) = ctx.saved_tensors
+        views, _, channels = cells.shape
+        both = (grad + grad.t()).to(cells.dtype)
+        flat = cells.reshape(-1, channels) @ both  # masked cells are zero, and so is their gradient
+        return flat.view(views, *ctx.cells, channels).permute(0, 3, 1, 2), None
+
+
+def layer_mask(
+    coverage: Float[Tensor, "views height width"], shape: tuple[int, int], erosion: int
+) -> Bool[Tensor, "views cells_y cells_x"]:
+    """Cells of a layer that see only foreground: fully covered, and ``erosion`` cells from the
+    nearest cell that isn't. The frame's border doesn't erode."""
+    return layer_masks(coverage, [shape], erosion)[0]
+
+
+def layer_masks(
+    coverage: Float[Tensor, "views height width"], shapes: Sequence[tuple[int, int]], erosion: int
+) -> list[Bool[Tensor, "views cells_y cells_x"]]:
+    """`layer_mask` for several layers, from one summed-area table of uncovered pixels: a cell and
+    its neighbours form one rectangle of pixels."""
+    background = ~(1 - coverage.detach() < 0.5)
+    summed = functional.pad(background, (1, 0, 1, 0)).to(torch.int32)
+    for dim in (1, 2):
+        summed = summed.cumsum(dim, dtype=torch.int32)
+    masks = []
+    for shape in shapes:
+        counted = summed
+        for dim, cells in enumerate(shape, 1):
+            size, cell = coverage.shape[dim], torch.arange(cells, device=coverage.device)
+            first, last = (cell - erosion).clamp_min(0), (cell + erosion).clamp_max(cells - 1)
+            # Sizes that don't divide evenly: a cell covers all pixels it touches.
+            begin, end = first * size // cells, ((last + 1) * size + cells - 1) // cells
+            counted = counted.index_select(dim, end) - counted.index_select(dim, begin)
+        masks.append(counted == 0)
+    return masks
+
+
+class StyleLoss:
+    """Computes the Gram matrices of images and their distance to a target."""
+
+    def __init__(self, config: LossConfig, encoder: Encoder):
+        self.config = config
+        self.encoder = encoder
+        self.layers = encoder.resolve(config.layers)
+        self.weights = [config.block_weights[int(name[4]) - 1] for name in self.layers]
+
+    def grams(self, seen: Images) -> Grams:
+        """One Gram per style layer, over the foreground only if configured."""
+        images = seen.image.permute(0, 3, 1, 2)
+        # A subclass may use activations other than those that the fused path sums.
+        if type(self.encoder) is Encoder and self.encoder.is_fused:
+            cells = [
+                (images.shape[2] // stride, images.shape[3] // stride)
+                for stride in map(self.encoder.stride, self.layers)
+            ]
+            by_name = dict(zip(self.layers, self._masks(seen, cells), strict=True))
+            sums = self.encoder.gram_sums(images, by_name)
+            return [
+                mean_gram(
+                    sums[name],
+                    by_name[name],
+                    len(images) * math.prod(shape),
+                    self.config.normalisation,
+                )
+                for name, shape in zip(self.layers, cells, strict=True)
+            ]
+        features = self.encoder(images, self.layers)
+        found = [features[name] for name in self.layers]
+        masks = self._masks(seen, [(each.shape[2], each.shape[3]) for each in found])
+        how = self.config.normalisation
+        return [gram_matrix(each, mask, how) for each, mask in zip(found, masks, strict=True)]
+
+    def _masks(
+        self, seen: Images, cells: Sequence[tuple[int, int]]
+    ) -> Sequence[Bool[Tensor, "n rows columns"] | None]:
+        """Masks of the cells that count, for layers of these sizes."""
+        if not self.config.masked:
+            return [None] * len(cells)
+        return layer_masks(seen.coverage, cells, self.config.erosion)
+
+    def distance(self, grams: Grams, target: Grams, scales: list[Tensor]) -> Float[Tensor, ""]:
+        """Weighted sum over layers of the squared Frobenius distances (Eq. 8), each divided by its
+        layer's scale."""
+        total = grams[0].new_zeros(())
+        for gram, goal, weight, scale in zip(grams, target, self.weights, scales, strict=True):
+            total = total + weight * (gram - goal).square().sum() / scale
+        return total
+
+    def scales(self, target: Grams, source: Grams) -> list[Tensor]:
+        """The divisor of each layer's distance: see ``LossConfig.relative``.
+
+        Infinite, which disables the layer, if the target is empty because no cell at that
+        resolution sees only foreground.
+        """
+        divisors = []
+        for goal, own in zip(target, source, strict=True):
+            norm = goal.square().sum()
+            if self.config.relative == "none":
+                scale = torch.ones_like(norm)
+            elif self.config.relative == "target":
+                scale = norm
+            else:
+                # A layer in which source and style hardly differ must not dominate the others.
+                scale = torch.maximum((own - goal).square().sum(), 0.02 * norm)
+            divisors.append(torch.where(norm > 0, scale, torch.inf))
+        return divisors
+
+
+class ClipLoss:
+    """Text2Mesh's loss (Michel et al. 2022): one minus the cosine between two mean embeddings.
+
+    Embeddings take the place of `StyleLoss`'s Gram matrices; the rest of a run is the same.
+    """
+
+    def __init__(self, config: LossConfig, encoder: ClipEncoder):
+        from styleexp.encoders.clip import ClipEncoder
+
+        if not isinstance(encoder, ClipEncoder):
+            raise UserError("loss=clip compares embeddings of whole pictures: use encoder=clip.")
+        self.config = config
+        self.encoder = encoder
+
+    def grams(self, seen: Images) -> list[Float[Tensor, " size"]]:
+        """The mean embedding of the pictures, background included."""
+        return [self.encoder(seen.image.permute(0, 3, 1, 2)).mean(0)]
+
+    def distance(
+        self, grams: list[Tensor], target: list[Tensor], scales: list[Tensor]
+    ) -> Float[Tensor, ""]:
+        """One minus the cosine, from 0 (same direction) to 2 (opposite)."""
+        return 1 - functional.cosine_similarity(grams[0], target[0], dim=0)
+
+    def scales(self, target: list[Tensor], source: list[Tensor]) -> list[Tensor]:
+        """Ones: cosines need no scaling."""
+        return [torch.ones_like(target[0][0])]

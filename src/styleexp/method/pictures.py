@@ -1,0 +1,153 @@
+"""Heights of a style image: a photo's tone, a height map, or an integrated normal map.
+
+A photo doesn't determine the amplitude of its relief; height maps and normal maps do, relative to
+the image's longer side.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from styleexp.inputs.images import is_normal_map, luminance
+from styleexp.method.relief import half_range
+from styleexp.system.errors import UserError
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch import Tensor
+
+    from styleexp.config.schema import Config, StyleConfig
+
+DEPTH = 0.1
+"""Default of ``style.image_depth``."""
+LEAST_CONTRAST = 1e-3
+"""Standard deviation of an image's tone in [0, 1], below which it is only rounding noise."""
+STEEPEST = 0.05
+"""Minimum z of a normal; steeper ones are clamped to a slope of about 20."""
+SEAM = 2.0
+"""An image counts as tileable if its opposite borders differ by at most this multiple of the
+difference between neighbouring rows or columns."""
+
+
+@dataclass(frozen=True)
+class Heights:
+    """Height of each pixel of a style image."""
+
+    kind: str
+    """``photo``, ``height``, ``normal`` or ``normal_dx``."""
+    height: Float[Tensor, "height width"]
+    """Row 0 at the top. For a photo the tone, without a unit; else in fractions of the image's
+    longer side."""
+
+    @property
+    def in_proportion(self) -> bool:
+        """Whether the heights are in fractions of the image's longer side."""
+        return self.kind != "photo"
+
+
+def kind_of(config: Config, picture: Float[np.ndarray, "height width 3"]) -> str:
+    """Resolve ``style.kind``. ``auto`` detects a normal map by its colours, and the direction of
+    green by which one integrates better. For methods that compare renders with the image's tone,
+    ``auto`` is ``photo``."""
+    if config.style.kind != "auto":
+        return config.style.kind
+    if config.baseline is None or not is_normal_map(picture):
+        return "photo"
+    misfit = [integrated(*slopes(picture, down))[1] for down in (False, True)]
+    return "normal_dx" if misfit[1] < 0.9 * misfit[0] else "normal"
+
+
+def picture_height(config: Config, picture: Float[np.ndarray, "height width 3"]) -> Heights:
+    """The image's heights, according to ``style.kind``, ``style.image_depth`` and ``style.invert``.
+
+    Raises `UserError` for an image without relief, or one that doesn't match its kind.
+    """
+    style = config.style
+    kind = kind_of(config, picture)
+    _check(style, kind, picture)
+    if kind.startswith("normal"):
+        found, _ = integrated(*slopes(picture, kind == "normal_dx"))
+        height = found / max(picture.shape[:2])
+    else:
+        height = luminance(picture).astype(np.float64)
+        if kind == "height":
+            height = height * (DEPTH if style.image_depth is None else style.image_depth)
+    return Heights(kind, torch.from_numpy(-height if style.invert else height).float())
+
+
+def spread(height: Float[Tensor, "height width"]) -> float:
+    """Half the percentile range of heights; for a map that is flat almost everywhere, half its full
+    range."""
+    values = height.cpu().numpy().ravel()
+    return max(half_range(values), 0.05 * float(np.ptp(values)), 1e-9)
+
+
+def _check(config: StyleConfig, kind: str, picture: np.ndarray) -> None:
+    name = config.path or config.name
+    if config.image_depth is not None and kind != "height":
+        raise UserError(
+            f"style.image_depth={config.image_depth} only applies to style.kind=height, but "
+            f"'{name}' is read as {kind}: add style.kind=height, or leave the depth out."
+        )
+    if kind.startswith("normal") and not is_normal_map(picture):
+        raise UserError(
+            f"style.kind={kind}: '{name}' is not a tangent-space normal map: its colours are not "
+            "unit vectors that point up on average; give style.kind=photo or style.kind=height."
+        )
+    tone = picture if kind.startswith("normal") else luminance(picture)[..., None]
+    if tone.std(axis=(0, 1)).max() < LEAST_CONTRAST:
+        raise UserError(
+            f"the style '{name}' is a picture of uniform tone, so there is nothing to transfer: "
+            "give one with contrast."
+        )
+
+
+def slopes(
+    picture: Float[np.ndarray, "height width 3"], green_down: bool
+) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
+    """Slopes of a normal map, per pixel to the right and per pixel down, without its mean tilt.
+
+    ``(n + 1) / 2`` is red to the right, green up (OpenGL) or ``green_down`` (DirectX), blue out.
+    """
+    x, y, z = np.moveaxis(2.0 * picture.astype(np.float64) - 1.0, -1, 0)
+    z = z.clip(STEEPEST)
+    right, down = -x / z, (-y if green_down else y) / z
+    return right - right.mean(), down - down.mean()
+
+
+def integrated(
+    right: Float[np.ndarray, "height width"], down: Float[np.ndarray, "height width"]
+) -> tuple[Float[np.ndarray, "height width"], float]:
+    """Least-squares heights, in pixels, for the given slopes (Frankot and Chellappa 1988), and the
+    fraction of the slopes' energy that isn't integrable.
+
+    Tileable maps are solved as periodic, others by mirroring.
+    """
+    rows, columns = right.shape
+    if not (_tiles(right, down) and _tiles(right.T, down.T)):
+        right = np.concatenate([right, -right[:, ::-1]], 1)
+        down = np.concatenate([down, down[:, ::-1]], 1)
+        right = np.concatenate([right, right[::-1]], 0)
+        down = np.concatenate([down, -down[::-1]], 0)
+    size = right.shape
+    v = 2j * np.pi * np.fft.fftfreq(size[0])[:, None]
+    u = 2j * np.pi * np.fft.rfftfreq(size[1])[None]
+    x, y = np.fft.rfft2(right), np.fft.rfft2(down)
+    square = np.abs(u) ** 2 + np.abs(v) ** 2
+    square[0, 0] = 1.0
+    found = (u.conj() * x + v.conj() * y) / square
+    found[0, 0] = 0.0
+    height = np.fft.irfft2(found, size)
+    left = np.abs(x - u * found) ** 2 + np.abs(y - v * found) ** 2
+    energy = np.abs(x) ** 2 + np.abs(y) ** 2
+    return height[:rows, :columns], float(left.sum() / max(energy.sum(), 1e-300))
+
+
+def _tiles(*columns: np.ndarray) -> bool:
+    """Whether the last column continues into the first."""
+    inner = sum(np.abs(np.diff(each, axis=1)).mean() for each in columns)
+    return sum(np.abs(each[:, 0] - each[:, -1]).mean() for each in columns) <= SEAM * inner

@@ -1,0 +1,139 @@
+"""Global and local views of a mesh in one step (Sec. 3.3.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+
+from styleexp.method import views
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch import Tensor
+
+    from styleexp.config.schema import Config
+    from styleexp.method.surface import Surface
+    from styleexp.renderers.base import Cameras, Renderer, Shading
+
+SURFACE_BANK = 192
+"""Number of surface points that a run's local views are drawn from."""
+
+
+@dataclass(frozen=True)
+class Images:
+    """Images for the encoder, and which of their pixels show the mesh."""
+
+    image: Float[Tensor, "n height width channels"]
+    coverage: Float[Tensor, "n height width"]
+
+
+class Viewer:
+    """Renders a mesh's views for any step; equal seeds give equal views.
+
+    ``scale`` magnifies the mesh: showing the style larger makes its pattern larger on the result.
+    Images have one channel per light; the ``lights`` are evenly spaced about the viewing axis,
+    starting with that of ``shading``.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        renderer: Renderer,
+        shading: Shading,
+        surface: Surface,
+        scale: float = 1.0,
+        lights: int = 1,
+    ):
+        self.config = config.views
+        self.light_spread = config.shading.light_spread
+        self.light_frame = config.shading.light_frame
+        self.seed = config.optim.seed
+        self.renderer = renderer
+        self.shading = shading
+        self.lights = lights
+        self.faces = surface.faces
+        self.scale = scale
+        self.surface_cameras: Cameras | None = None
+        if self.config.local.mode == "surface":
+            self.surface_cameras = views.surface_cameras(
+                surface,
+                self.config.local.extent / scale,
+                SURFACE_BANK,
+                views.step_generator(self.seed, 0, stream=1),
+                renderer,
+                shading,
+            )
+
+    def __call__(self, vertices: Float[Tensor, "vertices 3"], step: int) -> tuple[Images, Images]:
+        """Global and local views of the mesh with these vertices."""
+        generator = views.step_generator(self.seed, step)
+        cameras = views.sample_global(self.config, generator, vertices.device)
+        cameras = views.zoom(cameras, self.scale)
+        size = self.config.resolution
+        whole = self._render(vertices, cameras, size, generator)
+        warped = self._perspective(whole, generator)
+        cut_from = warped if self.config.local.perspective == "before" else whole
+        return warped, self._local(vertices, cameras, cut_from, generator)
+
+    def _local(
+        self,
+        vertices: Float[Tensor, "vertices 3"],
+        cameras: Cameras,
+        whole: Images,
+        generator: torch.Generator,
+    ) -> Images:
+        local, count = self.config.local, self.config.count
+        if self.surface_cameras is not None:
+            bank = self.surface_cameras
+            chosen = torch.randint(len(bank), (count * local.per_view,), generator=generator)
+            return self._render(vertices, bank[chosen], local.size, generator)
+        windows, view = views.crop_windows(local, count, generator)
+        windows, view = windows.to(vertices), view.to(vertices.device)
+        if local.mode == "zoom":
+            zoomed = views.crop_cameras(cameras, windows, view)
+            return self._render(vertices, zoomed, local.size, generator)
+        cut = views.crop_images(
+            torch.cat([whole.image, whole.coverage[..., None]], dim=-1), windows, view, local.size
+        )
+        seen = Images(cut[..., :-1], cut[..., -1])
+        return seen if local.perspective == "before" else self._perspective(seen, generator)
+
+    def _render(
+        self,
+        vertices: Float[Tensor, "vertices 3"],
+        cameras: Cameras,
+        size: int,
+        generator: torch.Generator,
+    ) -> Images:
+        turn = torch.zeros(len(cameras))
+        if self.light_spread > 0:
+            turn = self.light_spread * (2 * torch.rand(len(cameras), generator=generator) - 1)
+        lights = torch.stack(
+            [turned_light(self.shading, turn + 360 * i / self.lights) for i in range(self.lights)]
+        )
+        if self.light_frame == "world":
+            lights = torch.einsum("vij,lvj->lvi", cameras.rotation, lights.to(cameras.rotation))
+        out = self.renderer.render_lights(
+            vertices, self.faces, cameras, self.shading, lights, (size, size)
+        )
+        return Images(out.image, out.coverage)
+
+    def _perspective(self, seen: Images, generator: torch.Generator) -> Images:
+        if self.config.perspective == 0:
+            return seen
+        fill = self.config.perspective_fill
+        fill = self.shading.background if fill is None else fill
+        # The fill value is an image's; shifting by it makes coverage 0 outside the frame.
+        both = torch.cat([seen.image, seen.coverage[..., None] + fill], dim=-1)
+        both = views.random_perspective(self.config, both, fill, generator)
+        return Images(both[..., :-1], both[..., -1] - fill)
+
+
+def turned_light(shading: Shading, degrees: Float[Tensor, " views"]) -> Float[Tensor, "views 3"]:
+    """Rotate the light about the viewing axis, by one angle per view."""
+    x, y, z = torch.as_tensor(shading.light, dtype=torch.float32)
+    angle = degrees.deg2rad()
+    cos, sin = angle.cos(), angle.sin()
+    return torch.stack([x * cos - y * sin, x * sin + y * cos, z.expand(len(degrees))], dim=1)

@@ -1,0 +1,140 @@
+"""Identify the run in a folder by its key, never by the folder's location.
+
+The key is a hash of everything that determines a result. A job of a sweep or plan reads state and
+numbers only from a record with its own key; `not_of` explains a mismatch.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from styleexp.config.schema import Config
+
+FILES = ("source", "style")
+"""Configuration sections that may name a file."""
+
+
+@dataclass(frozen=True)
+class Named:
+    """A possible file of a run: one of `FILES`, or an image in ``style.mask``."""
+
+    name: str | None
+    path: str | None
+
+
+ABSENT = "not found"
+"""Placeholder for the sha256 of a missing file."""
+
+
+def essence(config: Mapping[str, Any]) -> Any:
+    """A run's configuration as plain JSON, without keys that don't affect the result."""
+    aside = ("threads", "debug", "logger", "report")
+    kept = {key: value for key, value in config.items() if key not in aside}
+    return json.loads(json.dumps(kept, default=str))
+
+
+def job_key(config: Config) -> str:
+    """Hash of everything that determines a run's result: its resolved configuration, this package's
+    version, and the content of its source and style files."""
+    from styleexp import __version__
+    from styleexp.config import sources
+    from styleexp.system.errors import UserError
+
+    files = {}
+    for kind, part in parts(config).items():
+        try:
+            path = sources.locate(kind, part.name, part.path)
+            files[kind] = sha256(path) if path else None
+        except UserError:  # the run reports it
+            files[kind] = ABSENT
+    return _hash(asdict(config), files, __version__)
+
+
+def parts(config: Config) -> dict[str, Named]:
+    """Possible files of a run, keyed ``source``, ``style`` and, for each image in ``style.mask``,
+    ``mask``, ``mask 2`` and so on."""
+    from styleexp.method import masks
+
+    found = {kind: Named(getattr(config, kind).name, getattr(config, kind).path) for kind in FILES}
+    for k, path in enumerate(masks.files(config.style.mask), 1):
+        found["mask" if k == 1 else f"mask {k}"] = Named(None, path)
+    return found
+
+
+def of(record: Mapping[str, Any]) -> str | None:
+    """Key of a recorded run; None for records of earlier versions that lack it."""
+    if isinstance(told := record.get("key"), str):
+        return told
+    try:
+        files = {kind: record["assets"][kind]["sha256"] for kind in FILES}
+        return _hash(record["config"], files, record["versions"]["styleexp"])
+    except (KeyError, TypeError, AttributeError):
+        return None
+
+
+def not_of(key: str | None, overrides: Sequence[str], record: Mapping[str, Any]) -> str | None:
+    """Why a record doesn't belong to the job with this key; None if it does.
+
+    Without a key, as in sweeps of earlier versions, the job is matched by its overrides.
+    """
+    if key and of(record) is None and "assets" not in record:
+        return None  # of an earlier version, ended before it read files or had numbers
+    theirs = record.get("overrides")
+    theirs = list(map(str, theirs)) if isinstance(theirs, list) else []
+    if (of(record) == key) if key else (theirs == list(overrides)):
+        return None
+    told = shlex.join(["styleexp", *theirs])
+    if theirs == list(overrides):
+        told = "the same overrides with other files or another version"
+    return f"the folder holds another run ({told})"
+
+
+def _hash(config: Mapping[str, Any], files: Mapping[str, str | None], version: str | None) -> str:
+    content = {"config": essence(config), "files": files, "by": version}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def sha256(path: Path) -> str:
+    """SHA-256 of a file, or `ABSENT`. For a ``.gltf`` with external buffers, which hold the
+    geometry, the hash of all their hashes."""
+    found = [_of_file(path), *map(_of_file, _buffers(path))]
+    return found[0] if len(found) == 1 else hashlib.sha256("".join(found).encode()).hexdigest()
+
+
+def _buffers(path: Path) -> list[Path]:
+    if path.suffix.lower() != ".gltf":
+        return []
+    from styleexp.inputs.meshes import references
+
+    try:
+        content = json.loads(path.read_bytes())
+        names = [each["uri"] for each in content.get("buffers", []) if "uri" in each]
+        found = [references.find(name, path.parent, path.parent)[0] for name in names
+                 if not name.startswith("data:")]  # fmt: skip
+    except (OSError, ValueError, RecursionError, TypeError, AttributeError):
+        return []  # it can't be read as a mesh either
+    return [each for each in found if each is not None]
+
+
+def _of_file(path: Path) -> str:
+    try:
+        known = path.stat()
+    except OSError:
+        return ABSENT
+    return _read(path.absolute(), known.st_mtime_ns, known.st_size, known.st_ino)
+
+
+@lru_cache(maxsize=4096)
+def _read(path: Path, *version: int) -> str:
+    """SHA-256 of a file, cached per ``version``."""
+    from styleexp.inputs import assets
+
+    return assets.sha256(path) if path.is_file() else ABSENT

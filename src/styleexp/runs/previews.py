@@ -1,0 +1,335 @@
+"""Pictures of a finished run: ``preview.png`` and ``turntable.gif``. Not used in optimisation.
+
+``preview=pyrender`` adds a check view: the result drawn by an independent renderer in another
+process, so that faults of the training renderer can't go unnoticed.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageFont
+
+from styleexp import plugins
+from styleexp.inputs import meshes
+from styleexp.method.scene import Scene
+from styleexp.method.views import orbit, zoom
+from styleexp.renderers.base import Cameras, Renderer, Shading
+from styleexp.renderers.soft_raster import SoftRaster
+from styleexp.runs.pyrender_view import UNAVAILABLE
+from styleexp.system.errors import UserError
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+    from styleexp.method.gram import Result
+
+VIEWS = (
+    ("front left", 15.0, 35.0),
+    ("right", 10.0, 100.0),
+    ("back", 20.0, 190.0),
+    ("left", 10.0, 280.0),
+)
+"""(label, elevation, azimuth) in degrees."""
+
+SUPERSAMPLING = 2
+LIGHT = (0.35, 0.45, 0.62)
+"""Light direction in camera space, from above right, so that relief is shaded."""
+
+CHECK_PLATFORMS = ("egl", "osmesa")
+"""Headless OpenGL platforms for pyrender, in order of preference."""
+CHECK_TIMEOUT = 600
+"""Seconds after which a check view counts as hung."""
+LEAST_IOU = 0.98
+"""Silhouette IoU below which a warning is issued."""
+
+
+def render_views(
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: np.ndarray,
+    elevations: list[float],
+    azimuths: list[float],
+    size: int,
+) -> np.ndarray:
+    """Render a mesh in the unit sphere, tightly framed, as 8-bit grey (views, size, size)."""
+    shading = Shading(albedo=0.8, ambient=0.22, light=LIGHT, background=1.0, normals="smooth")
+    points = torch.from_numpy(np.ascontiguousarray(vertices)).float()
+    cameras = framed(points, elevations, azimuths)
+    large = size * SUPERSAMPLING
+    with torch.no_grad():
+        out = SoftRaster().render(
+            points,
+            torch.from_numpy(np.ascontiguousarray(faces)),
+            cameras,
+            shading,
+            (large, large),
+        )
+        small = torch.nn.functional.avg_pool2d(out.image.permute(0, 3, 1, 2), SUPERSAMPLING)
+    return (small[:, 0].clamp(0, 1) * 255).round().byte().numpy()
+
+
+def framed(
+    points: Float[torch.Tensor, "vertices 3"], elevations: list[float], azimuths: list[float]
+) -> Cameras:
+    """Cameras around the origin, angles in degrees, with one common zoom that just fits all
+    points."""
+    radians = math.pi / 180
+    cameras = orbit(torch.tensor(elevations) * radians, torch.tensor(azimuths) * radians, 3.0, 40.0)
+    seen = torch.einsum("nij,vj->nvi", cameras.rotation, points) + cameras.translation[:, None]
+    reach = (cameras.focal[:, None] * seen[..., :2] / -seen[..., 2:]).abs().max()
+    return zoom(cameras, 0.94 / float(reach))
+
+
+def write_preview(result: Result, path: Path) -> None:
+    """Draw source, style and result, four labelled views each; an image style is shown as is."""
+    scene, size = result.scene, result.scene.config.preview.resolution
+    elevations, azimuths = [v[1] for v in VIEWS], [v[2] for v in VIEWS]
+
+    def shown(vertices: np.ndarray, faces: np.ndarray) -> list[Image.Image]:
+        pictures = render_views(vertices, faces, elevations, azimuths, size)
+        return [Image.fromarray(p) for p in pictures]
+
+    source = scene.frame.apply(scene.source.vertices)
+    rows = [(f"source: {scene.source.name}", shown(source, scene.source.faces))]
+    if isinstance(scene.style, meshes.Mesh):
+        style = meshes.normalisation(scene.style.vertices).apply(scene.style.vertices)
+        rows.append((f"style: {scene.style.name}", shown(style, scene.style.faces)))
+    else:
+        picture = Image.fromarray((scene.style * 255).round().astype(np.uint8)).convert("L")
+        picture.thumbnail((size, size))
+        chosen = scene.config.style
+        rows.append((f"style: {Path(chosen.path or str(chosen.name)).stem}", [picture]))
+    generated = scene.frame.apply(result.vertices)
+    rows.append(("result", shown(generated, scene.source.faces)))
+    sheet(rows, size).save(path)
+
+
+def write_turntable(result: Result, path: Path) -> None:
+    """Draw one turn of the result, as an animated GIF."""
+    preview = result.scene.config.preview
+    frames = preview.turntable_frames
+    azimuths = [360.0 * i / frames for i in range(frames)]
+    generated = result.scene.frame.apply(result.vertices)
+    pictures = render_views(
+        generated, result.scene.source.faces, [15.0] * frames, azimuths, preview.resolution
+    )
+    _write_gif(pictures, path)
+
+
+@dataclass(frozen=True)
+class CheckView:
+    """Pictures drawn by pyrender."""
+
+    pictures: np.ndarray
+    """(views, size, size), 8-bit grey, with pyrender's lighting."""
+    covered: np.ndarray
+    """(views, size, size), bool."""
+    platform: str
+    """``egl`` or ``osmesa``."""
+    device: str
+    """OpenGL device: a GPU, or ``llvmpipe ...``."""
+
+
+def check_views(
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: np.ndarray,
+    cameras: Cameras,
+    size: int,
+    platform: str = "auto",
+) -> CheckView:
+    """Draw a mesh with pyrender in a separate process.
+
+    ``platform`` is ``egl``, ``osmesa`` or ``auto`` (EGL, else OSMesa). Raises ``UserError`` if
+    pyrender is not installed, no platform works, or the process fails or hangs.
+    """
+    if importlib.util.find_spec("pyrender") is None:
+        raise UserError(
+            "preview=pyrender needs a package: pip install 'styleexp[gl]', or choose "
+            "preview=builtin."
+        )
+    job = {
+        "vertices": np.asarray(vertices, np.float64),
+        "faces": np.asarray(faces),
+        "near": cameras.near,
+        "size": size,
+    }
+    for name in ("rotation", "translation", "focal", "center"):
+        job[name] = getattr(cameras, name).double().cpu().numpy()
+    reasons = []
+    for chosen in CHECK_PLATFORMS if platform == "auto" else (platform,):
+        with tempfile.TemporaryDirectory(prefix="styleexp-check-") as folder:
+            reason = _run_check(job, Path(folder), chosen)
+            if reason is None:
+                with np.load(Path(folder) / "out.npz") as out:
+                    drawn = dict(out)
+                return CheckView(drawn["pictures"], drawn["covered"], chosen, str(drawn["device"]))
+        reasons.append(f"{chosen}: {reason}")
+    raise UserError(
+        f"preview=pyrender can't draw ({'; '.join(reasons)}): install OpenGL with EGL or OSMesa "
+        "(Debian, Ubuntu: apt-get install libegl1 libgl1 libopengl0 libgl1-mesa-dri libosmesa6), "
+        "or choose preview=builtin."
+    )
+
+
+def _run_check(job: dict[str, Any], folder: Path, platform: str) -> str | None:
+    """Run a job's process, which writes ``out.npz``. Returns the reason if it fails."""
+    np.savez(folder / "in.npz", **job)
+    command = [sys.executable, "-m", "styleexp.runs.pyrender_view"]
+    try:
+        done = subprocess.run(
+            [*command, str(folder / "in.npz"), str(folder / "out.npz")],
+            env={**os.environ, "PYOPENGL_PLATFORM": platform},
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=CHECK_TIMEOUT,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return f"no picture after {CHECK_TIMEOUT} s"
+    if done.returncode == 0:
+        return None
+    last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+    return last if done.returncode == UNAVAILABLE else f"exit code {done.returncode}, {last}"
+
+
+def check_available(platform: str = "auto") -> None:
+    """Raise ``check_views``'s ``UserError`` now instead of at the end of a run."""
+    corners = torch.eye(3)
+    check_views(
+        corners.numpy(), np.array([[0, 1, 2]]), framed(corners, [20.0], [40.0]), 32, platform
+    )
+
+
+def silhouette_iou(
+    covered: np.ndarray,
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: np.ndarray,
+    cameras: Cameras,
+    renderer: Renderer,
+    device: torch.device | str = "cpu",
+) -> tuple[list[float], np.ndarray]:
+    """Agreement of a renderer's silhouettes with ``covered`` (views, size, size), bool.
+
+    Returns the IoU of every view, and this renderer's covered pixels.
+    """
+    cameras = replace(
+        cameras,
+        rotation=cameras.rotation.to(device),
+        translation=cameras.translation.to(device),
+        focal=cameras.focal.to(device),
+        center=cameras.center.to(device),
+    )
+    with torch.no_grad():
+        out = renderer.render(
+            torch.from_numpy(np.ascontiguousarray(vertices)).float().to(device),
+            torch.from_numpy(np.ascontiguousarray(faces)).to(device),
+            cameras,
+            Shading(outlines=False),
+            (covered.shape[1], covered.shape[2]),
+        )
+    own = (out.coverage >= 0.5).cpu().numpy()
+    both, either = (own & covered).sum((1, 2)), (own | covered).sum((1, 2))
+    return np.where(either > 0, both / np.maximum(either, 1), 1.0).tolist(), own
+
+
+def write_check(result: Result, write: Callable[[str, Callable[[Path], Any]], Path]) -> list[Path]:
+    """Write ``check.png``, ``check.gif`` and ``check.json``: the result drawn by pyrender.
+
+    ``write`` is ``RunFolder.write``. The training renderer's silhouettes are compared with
+    pyrender's at the same cameras; ``check.json`` holds the IoUs, and one below ``LEAST_IOU``
+    issues a warning. Returns the files' paths.
+    """
+    scene, preview = result.scene, result.scene.config.preview
+    faces = scene.source.faces
+    vertices = scene.frame.apply(result.vertices)
+    points = torch.from_numpy(np.ascontiguousarray(vertices)).float()
+    frames = preview.turntable_frames
+    elevations = [v[1] for v in VIEWS] + [15.0] * frames
+    azimuths = [v[2] for v in VIEWS] + [360.0 * i / frames for i in range(frames)]
+    cameras = framed(points, elevations, azimuths)
+    if isinstance(scene, Scene):
+        renderer = scene.viewer.renderer
+    else:  # a baseline may have no renderer
+        renderer = plugins.build("renderer", scene.config.renderer)
+    size, views = preview.check_resolution, slice(0, len(VIEWS))
+    drawn = check_views(vertices, faces, cameras, size, preview.platform)
+    ious, own = silhouette_iou(
+        drawn.covered[views],
+        vertices,
+        faces,
+        cameras[views],
+        renderer,
+        scene.surface.vertices.device,
+    )
+
+    name = scene.config.renderer.name
+    found = {
+        "least_iou": min(ious),
+        "views": [
+            {"view": label, "elevation": elevation, "azimuth": azimuth, "iou": iou}
+            for (label, elevation, azimuth), iou in zip(VIEWS, ious, strict=True)
+        ],
+        "renderer": name,
+        "check": f"pyrender, {drawn.platform}, {drawn.device}",
+        "resolution": size,
+    }
+    if min(ious) < LEAST_IOU:
+        warnings.warn(
+            "the result looks different in the check view: its silhouette seen from the "
+            f"{VIEWS[ious.index(min(ious))][0]} has an IoU of {min(ious):.3f} with {name}'s, "
+            f"expected at least {LEAST_IOU}; see check.png.",
+            stacklevel=2,
+        )
+    agreed = ", ".join(f"{iou:.4f}" for iou in ious)
+    rows = [
+        (
+            f"result, drawn by pyrender ({drawn.platform}): {', '.join(v[0] for v in VIEWS)}",
+            drawn.pictures[views],
+        ),
+        (
+            f"black where {name} disagrees; IoU {agreed}",
+            np.where(own != drawn.covered[views], 0, np.where(own, 200, 255)).astype(np.uint8),
+        ),
+    ]
+    drawn_rows = [(label, [Image.fromarray(p) for p in pictures]) for label, pictures in rows]
+    return [
+        write("check.json", lambda path: path.write_text(json.dumps(found, indent=2) + "\n")),
+        write("check.png", lambda path: sheet(drawn_rows, size).save(path)),
+        write("check.gif", lambda path: _write_gif(drawn.pictures[len(VIEWS) :], path)),
+    ]
+
+
+def _write_gif(pictures: np.ndarray, path: Path) -> None:
+    first, *rest = [Image.fromarray(p) for p in pictures]
+    first.save(path, save_all=True, append_images=rest, duration=80, loop=0, optimize=True)
+
+
+def sheet(rows: list[tuple[str, list[Image.Image]]], size: int) -> Image.Image:
+    """Stack labelled rows of pictures, none larger than ``size``."""
+    band = max(18, size // 12)
+    font = ImageFont.load_default(size=band * 0.62)
+    columns = max(len(pictures) for _, pictures in rows)
+    sheet = Image.new("L", (columns * size, len(rows) * (size + band)), 255)
+    draw = ImageDraw.Draw(sheet)
+    for row, (label, pictures) in enumerate(rows):
+        top = row * (size + band)
+        draw.rectangle((0, top, sheet.width, top + band), fill=232)
+        draw.text((band * 0.4, top + band * 0.15), label, fill=20, font=font)
+        for column, picture in enumerate(pictures):
+            left = column * size + (size - picture.width) // 2
+            sheet.paste(picture, (left, top + band + (size - picture.height) // 2))
+    return sheet

@@ -1,0 +1,1 @@
+"""Files, locks, processes, progress and errors; needs only the standard library."""
