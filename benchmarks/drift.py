@@ -31,12 +31,12 @@ import torch
 matplotlib.use("Agg")
 from matplotlib import pyplot
 
+from styleexp.config import build
 from styleexp.config.compose import compose
-from styleexp.method import gram
-from styleexp.method.baselines import method
-from styleexp.method.gram import State
+from styleexp.method.base import State
 from styleexp.method.losses import gram_matrix, layer_masks, mean_gram
-from styleexp.method.scene import Scene
+from styleexp.method.paper import displace
+from styleexp.method.scene import PaperScene
 
 STEPS = (1, 25, 50, 100)
 DRAWS = 8
@@ -47,22 +47,26 @@ RIM = 2
 """Cells around an outline that count as of it: they see it through the convolutions."""
 
 
-def measured(scene: Scene, state: State) -> dict[str, Any]:
+def measured(scene: PaperScene, state: State) -> dict[str, Any]:
     """The numbers of the file's head for a state of a run."""
-    surface, loss = scene.surface, scene.loss
+    subject, loss = scene.subject, scene.loss
+    surface, settings = subject.surface, subject.settings
     parameters = list(state.field.parameters())
     gradients, pulls = [], []
     for draw in range(DRAWS):
-        d = gram.displace(scene, state)
+        d = displace(scene, state, scene.precision)
         d.retain_grad()
         moved = surface.vertices + d[:, None] * surface.normals
-        if scene.config.optim.renormalize:
+        if settings.optim.renormalize:
             moved = moved / moved.detach().norm(dim=1).max()
         whole, local = scene.viewer(moved, LATER + draw)
         goals = scene.target(LATER + draw)
-        total = loss.config.lambda_global * loss.distance(
-            loss.grams(whole), goals[0], scene.scales[0]
-        ) + loss.config.lambda_local * loss.distance(loss.grams(local), goals[1], scene.scales[1])
+        total = settings.loss.lambda_global * loss.distance(
+            loss.describe(whole), goals[0], scene.scales[0]
+        )
+        total = total + settings.loss.lambda_local * loss.distance(
+            loss.describe(local), goals[1], scene.scales[1]
+        )
         state.optimizer.zero_grad()
         total.backward()
         assert d.grad is not None
@@ -81,7 +85,7 @@ def measured(scene: Scene, state: State) -> dict[str, Any]:
 
 
 @torch.no_grad()
-def parts(scene: Scene, moved: torch.Tensor) -> dict[str, dict[str, float]]:
+def parts(scene: PaperScene, moved: torch.Tensor) -> dict[str, dict[str, float]]:
     """Of each layer's distance over the global views, the shares of `PARTS`; nothing where the loss
     sees the foreground alone, or where the style isn't rendered at the same views."""
     loss, target = scene.loss, scene.target
@@ -118,8 +122,7 @@ def run(overrides: list[str]) -> list[dict[str, Any]]:
     """The numbers at each of `STEPS` of a run."""
     config = compose(overrides)
     config.optim.steps = max(config.optim.steps, STEPS[-1])
-    learned = method(config)
-    scene = learned.prepare(config)
+    learned, scene = build.prepare(config)
     state = learned.start(scene)
     rows = []
     for step in learned.optimise(scene, state):

@@ -14,7 +14,7 @@ from styleexp.config import compose
 from styleexp.experiments import execute as command
 from styleexp.runs import records
 from styleexp.runs.identity import essence, job_key
-from styleexp.runs.loggers import Loggers
+from styleexp.plugins.loggers import Loggers
 from styleexp.system.errors import UserError
 
 SMOKE = (

@@ -11,19 +11,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from styleexp import plugins
-from styleexp.config import sources, unread
+from styleexp.config import build, sources, unread
 from styleexp.config.compose import compose
 from styleexp.config.explain import explain
 from styleexp.config.overrides import is_file
 from styleexp.inputs import meshes
-from styleexp.method import baselines
 from styleexp.system import process
 from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
     from styleexp.config.schema import Config
     from styleexp.inputs.meshes import MeshLike
-    from styleexp.method.gram import Result
+    from styleexp.method.base import Result
 
 
 def stylize(source: MeshLike, style: MeshLike | np.ndarray, *overrides: str) -> Result:
@@ -52,16 +51,16 @@ def stylize(source: MeshLike, style: MeshLike | np.ndarray, *overrides: str) -> 
     its random state, and the state of a calling Hydra application.
     """
     config, given = configured(source, style, overrides)
-    with sources.given(**given), process.undisturbed(config):
+    with sources.given(**given), process.undisturbed(config.threads, config.optim.seed):
         if (told := unread.note([config], overrides)) is not None:
             warnings.warn(told, stacklevel=2)
-        method = baselines.method(config)
-        scene = method.prepare(config)
-        for note in scene.notes:
+        method, scene = build.prepare(config)
+        for note in (*scene.subject.notes, *scene.notes):
             warnings.warn(note, stacklevel=2)
         state = method.start(scene)
-        for _ in method.optimise(scene, state):
-            pass
+        if state is not None:
+            for _ in method.optimise(scene, state):
+                pass
         return method.finish(scene, state)
 
 

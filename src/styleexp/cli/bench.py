@@ -103,9 +103,9 @@ def _numbers(text: str) -> list[int]:
 def _render(options: argparse.Namespace) -> dict[str, Any]:
     import torch
 
+    from styleexp.config.build import choose_device
     from styleexp.experiments.bench import render
     from styleexp.experiments.bench.measuring import machine
-    from styleexp.method.scene import choose_device
 
     if options.repeats < 1 or options.threads < 1:
         raise UserError("--repeats and --threads: give 1 or more.")

@@ -133,10 +133,11 @@ def _board(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _truth(options: argparse.Namespace) -> dict[str, Any]:
-    from styleexp.config.schema import SourceConfig, StyleConfig
     from styleexp.config.sources import load_source, load_style
     from styleexp.experiments.metrics import truth
     from styleexp.inputs import meshes, shapes
+    from styleexp.inputs.options import SourceConfig
+    from styleexp.method.options import StyleConfig
 
     names = options.sources.split(",")
     sources = []
@@ -158,11 +159,11 @@ def _truth(options: argparse.Namespace) -> dict[str, Any]:
         pictures = {}
         for name in styles:
             found = load_style(StyleConfig(name=name))
-            if isinstance(found, meshes.Mesh):
+            if found.picture is None:
                 raise UserError(
                     f"--pictures: '{name}' is a mesh; omit the option to test all meshes."
                 )
-            pictures[name] = found
+            pictures[name] = found.picture
         board = truth.measure_pictures(sources, pictures, judge.name, options.windows, told)
     else:
         board = truth.measure_board(sources, judge.name, options.windows, told)

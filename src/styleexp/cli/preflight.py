@@ -15,13 +15,13 @@ class Preflight(Callback):
         from omegaconf import OmegaConf
 
         from styleexp.cli.main import stop
-        from styleexp.config import compose, schema, sources
+        from styleexp.config import checks, compose, sources
         from styleexp.system.errors import UserError
 
         try:
             ours = [key for key in config if key != "hydra"]  # its values aren't resolvable yet
             typed = compose.typed(OmegaConf.masked_copy(config, ours))
-            schema.check(typed)
+            checks.check(typed)
             sources.check(typed)
         except UserError as error:
             stop(error)

@@ -24,6 +24,7 @@ from styleexp.inputs.shapes import SOURCES, STYLES
 from styleexp.system.errors import UserError
 
 CONFIG_PATH = "pkg://styleexp.conf"
+PREVIEWS = ("builtin", "pyrender")
 PARTS = ("renderer", "encoder", "style", "field", "loss", "baseline")
 """Configuration keys whose options depend on the part they name. ``logger`` holds several parts,
 keyed by name."""
@@ -40,7 +41,7 @@ def register() -> None:
 def _fill(store: ConfigStore) -> None:
     """Store the schema, and one option per registered name."""
     store.store(name="base_config", node=schema.Config)
-    for name in map(str, schema.CHOICES["preview.name"]):
+    for name in PREVIEWS:
         store.store(group="preview", name=name, node={"name": name})
     meshes, pictures = asset_names("mesh"), asset_names("image")
     for name in {*SOURCES, *STYLES, *meshes}:
@@ -84,6 +85,11 @@ UNNAMED: dict[str, dict[str, Any]] = {
     "optim": {"unit_gradient": False},
 }
 """Values for options that are missing in old records because they didn't exist yet."""
+REMOVED: dict[str, dict[str, Any]] = {
+    "encoder": {"pooling": "max"},
+    "shading": {"light_spread": 0.0},
+}
+"""Options that old records have and this version doesn't, with the value that had no effect."""
 
 
 def recorded(config: Any) -> schema.Config:
@@ -103,6 +109,10 @@ def recorded(config: Any) -> schema.Config:
         for part, values in UNNAMED.items():
             if isinstance(config.get(part), dict):
                 config = {**config, part: {**values, **config[part]}}
+        for part, values in REMOVED.items():
+            if isinstance(config.get(part), dict):
+                kept = {k: v for k, v in config[part].items() if values.get(k, not v) != v}
+                config = {**config, part: kept}
     try:
         return typed(OmegaConf.create(words.literal(config)))
     except (OmegaConfBaseException, AssertionError, AttributeError, TypeError, ValueError) as error:

@@ -1,25 +1,27 @@
-"""Load the mesh or image for a configured name or path; refine the source for a style."""
+"""Resolve a configuration's source, style and masks to files, and load them."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from styleexp import plugins
 from styleexp.inputs import assets, images, meshes, shapes
-from styleexp.runs import identity
+from styleexp.inputs.style import Style
 from styleexp.system.errors import UserError, unknown_name
 from styleexp.system.progress import doing
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from styleexp.config.schema import Config, SourceConfig, StyleConfig
+    from styleexp.config.schema import Config
+    from styleexp.inputs.options import SourceConfig
+    from styleexp.method.options import StyleConfig
 
 IMAGE_SUFFIXES = (
     *(".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff"),
@@ -36,13 +38,17 @@ EXPORTS = {
 }
 """Formats to export instead, for files of common 3D programs."""
 
-PER_WAVE = 12.0
-"""Number of longest edges per wavelength of the style's relief when refining the source; half as
-many blur the grooves between bubbles."""
-MOST_REFINED = 200_000
-"""Maximum number of faces that refining aims for."""
-SHORTER = 0.65
-"""Ratio of mean to longest edge after refining, which halves edges."""
+FILES = ("source", "style")
+"""Configuration sections that may name a file."""
+
+
+@dataclass(frozen=True)
+class Named:
+    """A possible file of a run: one of `FILES`, or an image in ``style.mask``."""
+
+    name: str | None
+    path: str | None
+
 
 _GIVEN: ContextVar[Mapping[str, Any]] = ContextVar("given", default=MappingProxyType({}))
 
@@ -62,7 +68,7 @@ def check(config: Config) -> None:
 
     Reads no files and imports nothing heavy, so that a mistyped name is reported at once.
     """
-    for kind, part in identity.parts(config).items():
+    for kind, part in parts(config).items():
         path = locate(kind, part.name, part.path)
         if path is None:
             continue
@@ -70,6 +76,17 @@ def check(config: Config) -> None:
             where = "" if path.is_absolute() else f" in '{Path.cwd()}'"
             raise UserError(f"the {kind} '{path}' does not exist{where}: check its name.")
         _check_suffix(kind, path)
+
+
+def parts(config: Config) -> dict[str, Named]:
+    """Possible files of a run, keyed ``source``, ``style`` and, for each image in ``style.mask``,
+    ``mask``, ``mask 2`` and so on."""
+    from styleexp.method import masks
+
+    found = {kind: Named(getattr(config, kind).name, getattr(config, kind).path) for kind in FILES}
+    for k, path in enumerate(masks.files(config.style.mask), 1):
+        found["mask" if k == 1 else f"mask {k}"] = Named(None, path)
+    return found
 
 
 def _check_suffix(kind: str, path: Path) -> None:
@@ -91,33 +108,12 @@ def load_source(config: SourceConfig) -> meshes.Mesh:
     return meshes.remesh(mesh, config.remesh)
 
 
-def refined(mesh: meshes.Mesh, wavelength: float, how: str) -> meshes.Mesh:
-    """Refine the mesh until its edges are short enough for a relief of this wavelength, in radii.
-    ``how`` is ``source.refine``: a target number of faces, or ``auto``, at most `MOST_REFINED`."""
-    scale = meshes.normalisation(mesh.vertices).scale
-    area = meshes.face_areas(mesh.vertices, mesh.faces).sum()
-    faces = MOST_REFINED if how == "auto" else float(how)
-    longest = math.sqrt(area / (faces * math.sqrt(3) / 4)) / SHORTER
-    doing("refining the source for the style")
-    if how == "auto":
-        return meshes.refine(mesh, max(wavelength / PER_WAVE * scale, longest))
-    # On a uniform mesh, a tiny change of the length decides if all edges are halved or only some.
-    low, high = longest / 2, longest * 2
-    fine = mesh
-    for _ in range(8):
-        longest = math.sqrt(low * high)
-        fine = meshes.refine(mesh, longest)
-        if abs(math.log(len(fine.faces) / faces)) < 0.1:
-            break
-        low, high = (longest, high) if len(fine.faces) > faces else (low, longest)
-    return fine
-
-
-def load_style(config: StyleConfig) -> meshes.Mesh | np.ndarray:
-    """Load the style: a mesh, or an image of shape (height, width, 3) in [0, 1]."""
+def load_style(config: StyleConfig) -> Style:
+    """Load the style."""
+    name = config.path or config.name
     if "style" not in _GIVEN.get() and config.path is None and plugins.known("style", config.name):
-        return _checked(plugins.build("style", config), config.name)
-    return _load("style", config.name, config.path)
+        return Style.of(_checked(plugins.build("style", config), config.name), name)
+    return Style.of(_load("style", config.name, config.path), name)
 
 
 def _checked(style: meshes.Mesh | np.ndarray, name: str | None) -> meshes.Mesh | np.ndarray:

@@ -1,23 +1,23 @@
-"""Multi-layer encoders: VGG activations of an image, by layer name (paper Sec. 3.3.2).
+"""Encoders: features of images by layer (Sec. 3.3.2). The contract is in `base`.
 
-Importing this package is cheap: torch is imported by the first ``load_encoder`` call.
+Importing this package is cheap: torch is imported with the first name that needs it.
 """
 
 from __future__ import annotations
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
-from styleexp.encoders.specs import ENCODERS, load_encoder
-
 if TYPE_CHECKING:
-    from styleexp.encoders.vgg import Encoder
+    from styleexp.encoders.base import Encoder as Encoder
+    from styleexp.encoders.vgg import VGG as VGG
 
-__all__ = ["ENCODERS", "Encoder", "load_encoder"]
+_HOMES = {"Encoder": "base", "VGG": "vgg"}
+
+__all__ = ["VGG", "Encoder"]
 
 
 def __getattr__(name: str) -> Any:
-    if name == "Encoder":
-        from styleexp.encoders.vgg import Encoder
-
-        return Encoder
+    if name in _HOMES:
+        return getattr(importlib.import_module(f"styleexp.encoders.{_HOMES[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

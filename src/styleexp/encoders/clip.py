@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
+from styleexp.encoders.base import Encoder
 from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
@@ -25,12 +26,12 @@ STD = (0.26862954, 0.26130258, 0.27577711)
 WANTED = "a folder with config.json and model.safetensors, as transformers saves a CLIP model"
 
 
-class ClipEncoder(nn.Module):
+class ClipEncoder(Encoder):
     """Maps images to unit embeddings. Frozen, in fp32; gradients flow to the images."""
 
     mean: Tensor
     std: Tensor
-    precision = "fp32"
+    name = "clip"
 
     def __init__(self, tower: Any):
         super().__init__()
@@ -45,7 +46,7 @@ class ClipEncoder(nn.Module):
         """Raise `UserError`: CLIP has no layers; it only works with ``loss=clip``."""
         raise UserError("encoder=clip has no layers for this loss: use loss=clip with it.")
 
-    def forward(
+    def forward(  # type: ignore[override]  # an embedding, not layers: for `losses.ClipLoss` alone
         self, images: Float[Tensor, "images channels height width"]
     ) -> Float[Tensor, "images size"]:
         """Unit embeddings of images in [0, 1], RGB or grey, resized to CLIP's input."""

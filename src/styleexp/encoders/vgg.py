@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from styleexp.encoders import fused
+from styleexp.encoders.base import Encoder
 from styleexp.encoders.weights import (
     IMAGENET_MEAN,
     IMAGENET_STD,
@@ -38,7 +39,7 @@ PAPER_STD = (0.268, 0.261, 0.276)
 _PRECISION_NAMES = {torch.float32: "fp32", torch.bfloat16: "bf16", torch.float64: "fp64"}
 
 
-class Encoder(nn.Module):
+class VGG(Encoder):
     """VGG activations by layer name.
 
     The network consists of 3x3 convolutions with zero padding 1, ReLU, and 2x2 pooling between
@@ -92,7 +93,7 @@ class Encoder(nn.Module):
         self._turned: dict[str, tuple[Any, Tensor]] = {}
 
     @property
-    def precision(self) -> str:
+    def precision(self) -> str:  # type: ignore[override]
         """Compute precision, ``fp32`` or ``bf16``, derived from the weights' dtype."""
         dtype = next(self.convs.parameters()).dtype
         return _PRECISION_NAMES.get(dtype, str(dtype))
@@ -252,17 +253,28 @@ def build(
     name: str,
     weights: VGGWeights,
     *,
-    precision: str,
-    pooling: str,
+    precision: str = "auto",
+    pooling: str = "max",
     activations: str = "relu",
-    normalisation: str,
-    device: str | torch.device,
-) -> Encoder:
-    """Build an :class:`Encoder` in its final precision and on its device; options as in
-    ``load_encoder``."""
+    normalisation: str = "weights",
+    device: str | torch.device = "cpu",
+) -> VGG:
+    """Build a `VGG` in its final precision and on its device.
+
+    Args:
+        name: name in messages and records.
+        weights: its convolutions.
+        precision: ``fp32``, ``bf16``, or ``auto`` (bf16 if this processor is faster with it).
+            ``VGG.precision`` holds the choice.
+        pooling: ``max`` as trained, or ``avg`` (Gatys et al. 2016).
+        activations: after the ReLU (``relu``) or before it (``conv``).
+        normalisation: ``weights`` uses the mean and std that the network was trained with,
+            ``paper`` the paper's mean (0.481, 0.458, 0.408) and std (0.268, 0.261, 0.276).
+        device: device of the encoder.
+    """
     device = torch.device(device)
     paper = normalisation == "paper"
-    encoder = Encoder(
+    encoder = VGG(
         name,
         weights,
         pooling=pooling,

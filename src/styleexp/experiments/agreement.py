@@ -100,27 +100,30 @@ def held_out_losses(run: Path, results: list[np.ndarray]) -> list[float] | list[
     """
     import torch
 
+    from styleexp.config import build
     from styleexp.method import targets
-    from styleexp.method.scene import prepare
+    from styleexp.method.scene import PaperScene
     from styleexp.runs import origins, records
 
     config = origins.restored(records.read_record(run, "compare"), run, "compare")
     config.optim.seed += HELD_OUT_SEED  # local views of one seed all come from one bank of cameras
-    scene = prepare(config)
-    if any(len(vertices) != len(scene.source.vertices) for vertices in results):
+    _, scene = build.prepare(config)
+    assert isinstance(scene, PaperScene)
+    subject, weights = scene.subject, config.loss
+    if any(len(vertices) != len(subject.source.vertices) for vertices in results):
         return [None] * len(results)
     target, loss = scene.target(targets.BANK_STEP), scene.loss
 
     def measure(vertices: torch.Tensor) -> float:
-        grams = targets.mesh_grams(loss, scene.viewer, vertices)
+        found = targets.mesh_statistics(loss, scene.viewer, vertices, weights.bank_views)
         parts = [
-            float(loss.distance(*each)) for each in zip(grams, target, scene.scales, strict=True)
+            float(loss.distance(*each)) for each in zip(found, target, scene.scales, strict=True)
         ]
-        return loss.config.lambda_global * parts[0] + loss.config.lambda_local * parts[1]
+        return weights.lambda_global * parts[0] + weights.lambda_local * parts[1]
 
-    own = measure(scene.surface.vertices)
+    own = measure(subject.surface.vertices)
     return [
-        measure(torch.from_numpy(scene.frame.apply(v)).to(scene.surface.vertices)) / own
+        measure(torch.from_numpy(subject.frame.apply(v)).to(subject.surface.vertices)) / own
         for v in results
     ]
 

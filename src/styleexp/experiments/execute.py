@@ -23,10 +23,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from styleexp.config.schema import Config
-    from styleexp.method.baselines import Method
-    from styleexp.method.gram import Result, State, Step
-    from styleexp.method.scene import Subject
-    from styleexp.runs.loggers import Loggers
+    from styleexp.method.base import Method, Result, Scene, State, Step
+    from styleexp.plugins.loggers import Loggers
 
 
 SHOWN_METRICS = ("style_distance", "silhouette_iou", "flipped_faces", "spike")
@@ -171,16 +169,16 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
     import torch
 
     from styleexp import plugins
-    from styleexp.config.schema import check
+    from styleexp.config import build
+    from styleexp.config.checks import check
     from styleexp.experiments import metrics
     from styleexp.inputs import assets
-    from styleexp.method import baselines
-    from styleexp.method.scene import Scene
-    from styleexp.runs.loggers import Loggers
+    from styleexp.method.scene import PaperScene
+    from styleexp.plugins.loggers import Loggers
 
     started = time.perf_counter()
     check(config)
-    process.prepare(config)
+    process.prepare(config.threads, config.optim.seed)
     if config.preview.name == "pyrender":
         from styleexp.runs.previews import check_available
 
@@ -190,12 +188,13 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
     judge = metrics.judge_name(config.metrics.judge, config.encoder.name)
     if judge in assets.names("weights"):
         assets.find(judge, "weights")  # if unavailable, fail before the run, not after
-    method = baselines.method(config)
-    scene = method.prepare(config)
+    method, scene = build.prepare(config)
+    subject = scene.subject
+    notes = (*subject.notes, *scene.notes)
     if not folder.begun:
         folder.begin(record)
     doing("")
-    for note in scene.notes:
+    for note in notes:
         print(f"note: {note}")
     read = origins.describe(config)
     for kind, before in (record.get("assets") or {}).items():
@@ -214,23 +213,23 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
         if lost:
             print(f"note: metrics.jsonl is damaged: {lost} lines are lost.")
     record |= {
-        "device": str(scene.surface.vertices.device),
+        "device": str(subject.surface.vertices.device),
         "threads": torch.get_num_threads(),
-        "chosen": {"sigma": scene.sigma, "bound": scene.bound, "relief": scene.relief},
+        "chosen": {"sigma": subject.sigma, "bound": subject.bound, "relief": subject.relief},
         "assets": record.get("assets") or read,
-        "notes": list(scene.notes),
+        "notes": list(notes),
         "judge": judge,
     }
-    if isinstance(scene, Scene):
-        record["encoder_precision"] = scene.loss.encoder.precision
+    if isinstance(scene, PaperScene):
+        record["encoder_precision"] = scene.encoder.precision
     folder.write_json("run.json", record)
 
     with Loggers(config, folder.path, record, state.step if state else 0) as loggers:
-        if state is not None and not _optimise(method, scene, state, folder, loggers):
+        if state is not None and not _optimise(method, scene, state, config, folder, loggers):
             return 130
         result = method.finish(scene, state)
         step = state.step if state else 0
-        written, measured = _write_results(result, folder)
+        written, measured = _write_results(result, config, folder)
         seconds = time.perf_counter() - started
         if config.report:  # last, because it shows the other files
             from styleexp.experiments.reports import page
@@ -246,10 +245,15 @@ def _run(config: Config, folder: records.RunFolder, record: dict[str, Any], resu
 
 
 def _optimise(
-    method: Method, scene: Subject, state: State, folder: records.RunFolder, loggers: Loggers
+    method: Method[Any],
+    scene: Scene,
+    state: State,
+    config: Config,
+    folder: records.RunFolder,
+    loggers: Loggers,
 ) -> bool:
     """Run the remaining steps; return False if the user stopped them."""
-    optim = scene.config.optim
+    optim = config.optim
     blank = 0
     with _interruptible() as interrupted:
         steps = _explained(method.optimise(scene, state), folder)
@@ -268,7 +272,7 @@ def _optimise(
     if folder.checkpoint_step() != state.step:
         folder.save_checkpoint(state)
     if blank:
-        what = "were skipped" if scene.config.loss.masked else "counted as background"
+        what = "were skipped" if config.loss.masked else "counted as background"
         print(
             f"note: {blank} views did not show the mesh and {what} (blank_views in metrics.jsonl)"
         )
@@ -277,7 +281,7 @@ def _optimise(
 
 def _explained(steps: Iterator[Step], folder: records.RunFolder) -> Iterator[Step]:
     """Yield the steps; if they diverge, name the last good checkpoint in the error."""
-    from styleexp.method.gram import Diverged
+    from styleexp.method.base import Diverged
 
     try:
         yield from steps
@@ -290,7 +294,7 @@ def _explained(steps: Iterator[Step], folder: records.RunFolder) -> Iterator[Ste
 
 
 def _write_results(
-    result: Result, folder: records.RunFolder
+    result: Result, config: Config, folder: records.RunFolder
 ) -> tuple[list[Path], dict[str, float]]:
     from styleexp.runs import previews
 
@@ -298,18 +302,23 @@ def _write_results(
         doing(f"writing {name}")
         result.save(folder.path / name)
     doing("drawing the preview and the turntable")
-    folder.write("preview.png", lambda path: previews.write_preview(result, path))
-    folder.write("turntable.gif", lambda path: previews.write_turntable(result, path))
+    shown = config.preview
+    folder.write("preview.png", lambda path: previews.write_preview(result, shown.resolution, path))
+    folder.write(
+        "turntable.gif",
+        lambda path: previews.write_turntable(
+            result, shown.turntable_frames, shown.resolution, path
+        ),
+    )
     names = ("preview.png", "turntable.gif", "result.glb", "result.ply", "result.obj")
     written = [folder.path / name for name in names]
-    config = result.scene.config
     doing("measuring the result")
     found = _measure(result, config)
     doing("")
     folder.write_json("metrics.json", found)
     print("  ".join(f"{name} {found[name]:.3g}" for name in SHOWN_METRICS if name in found))
     if config.preview.name == "pyrender":
-        written += previews.write_check(result, folder.write)
+        written += previews.write_check(result, config, folder.write)
     return written, found
 
 
@@ -319,7 +328,7 @@ def _measure(result: Result, config: Config) -> dict[str, float]:
 
     name = metrics.judge_name(config.metrics.judge, config.encoder.name)
     judge = metrics.load_judge(name, config.metrics.windows)
-    source, style = result.scene.source, result.scene.style
+    source, style = result.subject.source, result.subject.style
     return metrics.measure(config, source, style, result.vertices, source.faces, judge)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from abc import abstractmethod
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -14,10 +15,36 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
-    from styleexp.config.schema import FieldConfig
+    from styleexp.method.options import FieldConfig
 
 REMEMBERED = 1 << 25
 """Maximum number of elements of a cached encoding, 128 MB."""
+
+
+class Field(nn.Module):
+    """The contract of a field: a displacement for every vertex. `testing.check_field` checks it.
+
+    Its parameters are learned and its buffers are not; both are checkpointed. All random numbers
+    come from the ``generator`` that its factory is given. It is moved with ``to(device)``.
+    """
+
+    @abstractmethod
+    def forward(
+        self,
+        points: Float[Tensor, "vertices 3"],
+        opened: float = 1.0,
+        precision: torch.dtype = torch.float32,
+    ) -> Float[Tensor, " vertices"]:
+        """Displacement of every vertex along its normal, float32 and differentiable in the
+        parameters, in radii of the normalised source.
+
+        Args:
+            points: the vertices of the normalised source: all of them, and the same in every step.
+            opened: fraction of the frequencies that pass (``field.progressive``), from 0 to 1; a
+                field without frequencies ignores it.
+            precision: dtype in which the costly part may compute, bfloat16 where that is faster.
+                The result is evaluated in float32.
+        """
 
 
 class FourierFeatures(nn.Module):
@@ -60,7 +87,7 @@ class FourierFeatures(nn.Module):
         return self._known[3]
 
 
-class DisplacementField(nn.Module):
+class FourierMLP(Field):
     """MLP that maps a position to its displacement along the normal, in (-bound, bound).
 
     The last layer starts at zero, so that the generated mesh equals the source at step 0, unless
@@ -91,15 +118,15 @@ class DisplacementField(nn.Module):
         self.last = linears[-1]
 
     def forward(
-        self, encoded: Float[Tensor, "vertices size"], precision: torch.dtype = torch.float32
+        self,
+        points: Float[Tensor, "vertices 3"],
+        opened: float = 1.0,
+        precision: torch.dtype = torch.float32,
     ) -> Float[Tensor, " vertices"]:
-        """Displacement for each row of ``encode(points)``, in radii of the normalised source. Takes
-        all vertices at once.
-
-        Hidden layers run in ``precision``; the last one always runs in float32, because
-        neighbouring displacements differ by less than bfloat16 can resolve.
+        """See `Field`. Hidden layers run in ``precision``; the last one always runs in float32,
+        because neighbouring displacements differ by less than bfloat16 can resolve.
         """
-        x = encoded.to(precision)
+        x = self.encode(points, opened).to(precision)
         fused = x.device.type == "cpu" and torch.backends.mkldnn.is_available()
         fused = fused and precision == torch.bfloat16
         for layer in self.hidden:
@@ -132,37 +159,24 @@ class _LinearRelu(torch.autograd.Function):
         return into, grad.t() @ x, grad.sum(0)
 
 
-class VertexField(nn.Module):
-    """A free displacement per vertex, in (-bound, bound): the field without the network.
+class VertexField(Field):
+    """A free displacement per vertex, in (-bound, bound), from zero: the field without the
+    network."""
 
-    Starts at zero. The number of vertices is set by the first call of ``encode``; create the
-    optimiser after it.
-    """
-
-    latent: nn.Parameter
-
-    def __init__(self, bound: float):
+    def __init__(self, vertices: int, bound: float):
         super().__init__()
         self.bound = bound
-        self.latent = nn.UninitializedParameter()  # type: ignore[assignment]
-
-    def encode(
-        self, points: Float[Tensor, "vertices 3"], opened: float = 1.0
-    ) -> Float[Tensor, "vertices 3"]:
-        """Return the points unchanged; ``opened`` is ignored."""
-        if isinstance(self.latent, nn.UninitializedParameter):
-            self.latent.materialize((len(points),), device=points.device)
-            nn.init.zeros_(self.latent)
-        return points
+        self.latent = nn.Parameter(torch.zeros(vertices))
 
     def forward(
-        self, encoded: Float[Tensor, "vertices 3"], precision: torch.dtype = torch.float32
+        self,
+        points: Float[Tensor, "vertices 3"],
+        opened: float = 1.0,
+        precision: torch.dtype = torch.float32,
     ) -> Float[Tensor, " vertices"]:
-        """Displacement per vertex, in radii of the normalised source."""
-        if len(encoded) != len(self.latent):
-            raise ValueError(
-                f"the field has {len(self.latent)} vertices, got {len(encoded)} points"
-            )
+        """See `Field`; ``opened`` and ``precision`` have no effect."""
+        if len(points) != len(self.latent):
+            raise ValueError(f"the field has {len(self.latent)} vertices, got {len(points)} points")
         return self.bound * torch.tanh(self.latent)
 
 

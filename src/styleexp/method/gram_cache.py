@@ -12,60 +12,65 @@ import hashlib
 import os
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 
-from styleexp import plugins
 from styleexp.inputs import assets
 from styleexp.system import atomic, digests
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from styleexp.config.schema import Config
-    from styleexp.encoders import Encoder
-    from styleexp.method.losses import Grams
+    from styleexp.encoders.base import Encoder
+    from styleexp.method.losses import Statistics
 
 KEPT = 40
 """Maximum number of files, about 5 MB each; the least recently used are evicted."""
 
 
-def grams(
-    config: Config, encoder: Encoder, about: list[object], make: Callable[[], tuple[Grams, Grams]]
-) -> tuple[Grams, Grams]:
-    """Return ``make()``, cached on disk.
+@dataclass(frozen=True)
+class GramCache:
+    """Remembers what `losses.GramLoss` says of a bank of views."""
 
-    ``about`` holds its other inputs: tensors, or objects that ``repr`` distinguishes. Results that
-    involve plugins, whose code can't be hashed, are never cached.
-    """
-    parts = (("renderer", config.renderer), ("encoder", config.encoder), ("loss", config.loss))
-    own = all(plugins.find(kind, part.name).origin == plugins.OWN for kind, part in parts)
-    if not own or config.loss.name != "gram":
-        return make()
-    path = assets.cache_dir() / "grams" / f"{_digest(config, encoder, about)}.safetensors"
-    found = _read(path, encoder)
-    if found is None:
-        found = make()
-        _write(path, found)
-    return found
+    options: tuple[object, ...]
+    """Options of everything involved, distinguished by ``repr``."""
+    encoder: Encoder
+
+    def __call__(
+        self, about: list[object], make: Callable[[], tuple[Statistics, Statistics]]
+    ) -> tuple[Statistics, Statistics]:
+        """Return ``make()``, cached on disk. ``about`` holds its other inputs: tensors, or objects
+        that ``repr`` distinguishes."""
+        path = assets.cache_dir() / "grams" / f"{self._digest(about)}.safetensors"
+        found = _read(path, self.encoder)
+        if found is None:
+            found = make()
+            _write(path, found)
+        return found
+
+    def _digest(self, about: list[object]) -> str:
+        digest = hashlib.sha256(_code())
+        known = [*self.options, torch.__version__, torch.get_num_threads()]
+        known += [torch.backends.cpu.get_cpu_capability(), self.encoder.precision]
+        for item in [*known, *about, *self.encoder.state_dict().values()]:
+            if isinstance(item, torch.Tensor):
+                flat = item.detach().cpu().contiguous().flatten()
+                digest.update(f"{item.device} {item.dtype} {tuple(item.shape)}".encode())
+                digest.update(flat.view(torch.uint8).numpy().data)
+            else:
+                digest.update(f"{item!r};".encode())
+        return digest.hexdigest()[:32]
 
 
-def _digest(config: Config, encoder: Encoder, about: list[object]) -> str:
-    options = [config.views, config.shading, config.encoder, config.loss, config.renderer]
-    digest = hashlib.sha256(_code())
-    known = [*options, config.optim.seed, torch.__version__, torch.get_num_threads()]
-    known += [torch.backends.cpu.get_cpu_capability(), encoder.precision]
-    for item in [*known, *about, *encoder.state_dict().values()]:
-        if isinstance(item, torch.Tensor):
-            flat = item.detach().cpu().contiguous().flatten()
-            digest.update(f"{item.device} {item.dtype} {tuple(item.shape)}".encode())
-            digest.update(flat.view(torch.uint8).numpy().data)
-        else:
-            digest.update(f"{item!r};".encode())
-    return digest.hexdigest()[:32]
+def uncached(
+    about: list[object], make: Callable[[], tuple[Statistics, Statistics]]
+) -> tuple[Statistics, Statistics]:
+    """Return ``make()``: for parts whose code can't be hashed, such as plugins'."""
+    return make()
 
 
 @cache
@@ -77,7 +82,7 @@ def _code() -> bytes:
     return digest.digest()
 
 
-def _read(path: Path, encoder: Encoder) -> tuple[Grams, Grams] | None:
+def _read(path: Path, encoder: Encoder) -> tuple[Statistics, Statistics] | None:
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -90,12 +95,13 @@ def _read(path: Path, encoder: Encoder) -> tuple[Grams, Grams] | None:
         return None
     with suppress(OSError):  # read-only cache
         os.utime(path)
-    ordered = [(name, tensors[name].to(encoder.mean.device)) for name in sorted(tensors)]
+    device = next(encoder.parameters()).device
+    ordered = [(name, tensors[name].to(device)) for name in sorted(tensors)]
     whole, local = ([t for n, t in ordered if n.startswith(k)] for k in ("global", "local"))
     return whole, local
 
 
-def _write(path: Path, found: tuple[Grams, Grams]) -> None:
+def _write(path: Path, found: tuple[Statistics, Statistics]) -> None:
     from safetensors.torch import save
 
     tensors: dict[str, Tensor] = {}

@@ -17,7 +17,7 @@ import torch
 from torch.nn import functional
 
 from styleexp.inputs import meshes, shapes
-from styleexp.method import pictures, targets
+from styleexp.method import pictures
 from styleexp.method.fields import zero_mean
 from styleexp.method.relief import half_range, mesh_relief
 from styleexp.system.errors import UserError
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from torch import Tensor
 
-    from styleexp.config.schema import Config
-    from styleexp.method.scene import Subject
+    from styleexp.method.options import StyleConfig
+    from styleexp.method.subject import Subject
 
 AXES = ((2, 1), (0, 2), (0, 1))
 """Source axes of the map's right and up, for the projections along x, y and z."""
@@ -63,7 +63,10 @@ class HeightMap:
 
 
 def displacement(
-    scene: Subject, height: float | None = None, patch: float = PATCH, sharpness: float = SHARPNESS
+    subject: Subject,
+    height: float | None = None,
+    patch: float = PATCH,
+    sharpness: float = SHARPNESS,
 ) -> Float[Tensor, " vertices"]:
     """The style's height map as a displacement of the source's vertices, in radii of the normalised
     source. Its area-weighted mean over the surface (over the masked part, if there is a mask) is
@@ -71,26 +74,28 @@ def displacement(
 
     ``height`` is half its range; defaults to that of the style's own relief.
     """
-    tile, surface = height_map(scene, patch), scene.surface
+    tile, surface = height_map(subject, patch), subject.surface
     raised = triplanar(tile, surface.vertices, surface.normals, sharpness)
-    height = scene.relief if height is None else height
-    return zero_mean(height * raised, scene.weights, math.inf)
+    height = subject.relief if height is None else height
+    return zero_mean(height * raised, subject.weights, math.inf)
 
 
-def height_map(scene: Subject, patch: float) -> HeightMap:
+def height_map(subject: Subject, patch: float) -> HeightMap:
     """The style as a height map, sized by ``style.scale`` and ``style.image_tile``."""
-    style, device = scene.style, scene.surface.vertices.device
-    heights = scene.heights
+    style, device = subject.style, subject.surface.vertices.device
+    heights = subject.heights
     if heights is not None:
         height = heights.height.to(device)
-        side = picture_side(scene.config, scene.unit)
+        side = picture_side(subject.settings.style, subject.unit)
     else:
-        assert isinstance(style, meshes.Mesh)
-        height = torch.from_numpy(mesh_patch(style, patch)).to(device)
-        side = patch * math.sqrt(2) * scene.unit
+        assert style.mesh is not None
+        height = torch.from_numpy(mesh_patch(style.mesh, patch)).to(device)
+        side = patch * math.sqrt(2) * subject.unit
     # Detail finer than the source's edges would alias to noise.
-    edge = meshes.mean_edge_length(scene.source.vertices, scene.source.faces) / scene.frame.scale
-    fit = targets.resized(height, min(side / edge, max(height.shape)))
+    edge = (
+        meshes.mean_edge_length(subject.source.vertices, subject.source.faces) / subject.frame.scale
+    )
+    fit = pictures.resized(height, min(side / edge, max(height.shape)))
     if heights is not None and heights.in_proportion:
         half = pictures.spread(heights.height)  # before filtering, so the amplitude is unchanged
     else:
@@ -98,9 +103,9 @@ def height_map(scene: Subject, patch: float) -> HeightMap:
     return HeightMap((fit - fit.mean()) / half, side)
 
 
-def picture_side(config: Config, unit: float) -> float:
+def picture_side(config: StyleConfig, unit: float) -> float:
     """Length of a style image's longer side on the result, in radii of the normalised source."""
-    return unit * config.style.image_tile * math.sqrt(4 * math.pi)
+    return unit * config.image_tile * math.sqrt(4 * math.pi)
 
 
 def mesh_patch(style: meshes.Mesh, radius: float) -> Float[np.ndarray, "side side"]:

@@ -4,26 +4,68 @@ comparison."""
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
-from styleexp.encoders import Encoder
+from styleexp.encoders.vgg import VGG
 from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
     from torch import Tensor
 
-    from styleexp.config.schema import LossConfig
-    from styleexp.encoders.clip import ClipEncoder
+    from styleexp.encoders.base import Encoder
+    from styleexp.inputs.style import Style
+    from styleexp.method.options import LossConfig
     from styleexp.method.viewer import Images
 
-Grams = list["Float[Tensor, 'channels channels']"]
-"""One Gram matrix per style layer, averaged over views."""
+Statistics = list["Tensor"]
+"""What a loss compares of a set of views, averaged over them: for `GramLoss` one matrix per style
+layer. Any number of tensors of any shapes, always the same for one loss."""
+
+
+class Loss(ABC):
+    """The contract of a loss: it describes views, and measures how far descriptions are apart.
+    `testing.check_loss` checks all of this.
+
+    The loop describes global and local views of the generated mesh in every step, and those of the
+    style once or in every step (``loss.target``). What is minimised is ``lambda_global`` times the
+    distance of the global views plus ``lambda_local`` times that of the local ones (Eq. 7); the
+    loop reads these weights itself.
+    """
+
+    def for_style(self, style: Style) -> Loss:
+        """The loss to use for this style; called once, before anything is described."""
+        return self
+
+    @abstractmethod
+    def describe(self, seen: Images) -> Statistics:
+        """Statistics of views, averaged over them; differentiable in ``seen.image``, of shape
+        (views, height, width, channels).
+
+        A statistic that nothing in the views counts for, as of a mask (``seen.coverage``) without
+        foreground, is all zeros, never NaN. Views may be described in several calls and their
+        statistics averaged, so a statistic must be linear in the views.
+        """
+
+    @abstractmethod
+    def distance(
+        self, found: Statistics, target: Statistics, scales: list[Tensor]
+    ) -> Float[Tensor, ""]:
+        """How far the generated mesh's statistics are from the style's; zero if they are equal.
+        ``scales`` are those that `scales` returned."""
+
+    def scales(self, target: Statistics, source: Statistics) -> list[Tensor]:
+        """A divisor for each statistic's part of the distance, from the style's statistics and
+        those of the source; called once each for global and for local views. Infinite for a
+        statistic of the style that is all zeros. The default doesn't scale."""
+        return [torch.where(each.any(), 1.0, torch.inf) for each in target]
 
 
 UNDIVIDED = 1e6
@@ -118,8 +160,8 @@ def layer_masks(
     return masks
 
 
-class StyleLoss:
-    """Computes the Gram matrices of images and their distance to a target."""
+class GramLoss(Loss):
+    """Distances of the Gram matrices of an encoder's layers (Eqs. 3-8), one per style layer."""
 
     def __init__(self, config: LossConfig, encoder: Encoder):
         self.config = config
@@ -127,11 +169,17 @@ class StyleLoss:
         self.layers = encoder.resolve(config.layers)
         self.weights = [config.block_weights[int(name[4]) - 1] for name in self.layers]
 
-    def grams(self, seen: Images) -> Grams:
+    def for_style(self, style: Style) -> GramLoss:
+        """Decide ``loss.masked=pictures`` for this style."""
+        if self.config.masked != "pictures":
+            return self
+        return GramLoss(replace(self.config, masked=style.picture is not None), self.encoder)
+
+    def describe(self, seen: Images) -> Statistics:
         """One Gram per style layer, over the foreground only if configured."""
         images = seen.image.permute(0, 3, 1, 2)
         # A subclass may use activations other than those that the fused path sums.
-        if type(self.encoder) is Encoder and self.encoder.is_fused:
+        if type(self.encoder) is VGG and self.encoder.is_fused:
             cells = [
                 (images.shape[2] // stride, images.shape[3] // stride)
                 for stride in map(self.encoder.stride, self.layers)
@@ -161,15 +209,17 @@ class StyleLoss:
             return [None] * len(cells)
         return layer_masks(seen.coverage, cells, self.config.erosion)
 
-    def distance(self, grams: Grams, target: Grams, scales: list[Tensor]) -> Float[Tensor, ""]:
+    def distance(
+        self, found: Statistics, target: Statistics, scales: list[Tensor]
+    ) -> Float[Tensor, ""]:
         """Weighted sum over layers of the squared Frobenius distances (Eq. 8), each divided by its
         layer's scale."""
-        total = grams[0].new_zeros(())
-        for gram, goal, weight, scale in zip(grams, target, self.weights, scales, strict=True):
+        total = found[0].new_zeros(())
+        for gram, goal, weight, scale in zip(found, target, self.weights, scales, strict=True):
             total = total + weight * (gram - goal).square().sum() / scale
         return total
 
-    def scales(self, target: Grams, source: Grams) -> list[Tensor]:
+    def scales(self, target: Statistics, source: Statistics) -> list[Tensor]:
         """The divisor of each layer's distance: see ``LossConfig.relative``.
 
         Infinite, which disables the layer, if the target is empty because no cell at that
@@ -189,30 +239,22 @@ class StyleLoss:
         return divisors
 
 
-class ClipLoss:
-    """Text2Mesh's loss (Michel et al. 2022): one minus the cosine between two mean embeddings.
+class ClipLoss(Loss):
+    """Text2Mesh's loss (Michel et al. 2022): one minus the cosine between two mean embeddings."""
 
-    Embeddings take the place of `StyleLoss`'s Gram matrices; the rest of a run is the same.
-    """
-
-    def __init__(self, config: LossConfig, encoder: ClipEncoder):
+    def __init__(self, encoder: Encoder):
         from styleexp.encoders.clip import ClipEncoder
 
         if not isinstance(encoder, ClipEncoder):
             raise UserError("loss=clip compares embeddings of whole pictures: use encoder=clip.")
-        self.config = config
         self.encoder = encoder
 
-    def grams(self, seen: Images) -> list[Float[Tensor, " size"]]:
+    def describe(self, seen: Images) -> Statistics:
         """The mean embedding of the pictures, background included."""
         return [self.encoder(seen.image.permute(0, 3, 1, 2)).mean(0)]
 
     def distance(
-        self, grams: list[Tensor], target: list[Tensor], scales: list[Tensor]
+        self, found: Statistics, target: Statistics, scales: list[Tensor]
     ) -> Float[Tensor, ""]:
         """One minus the cosine, from 0 (same direction) to 2 (opposite)."""
-        return 1 - functional.cosine_similarity(grams[0], target[0], dim=0)
-
-    def scales(self, target: list[Tensor], source: list[Tensor]) -> list[Tensor]:
-        """Ones: cosines need no scaling."""
-        return [torch.ones_like(target[0][0])]
+        return 1 - functional.cosine_similarity(found[0], target[0], dim=0)

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
-    from styleexp.config.schema import StyleConfig
     from styleexp.inputs.meshes import Mesh
+    from styleexp.method.options import StyleConfig
 
 CHANNELS = ("r", "g", "b", "a", "luminance")
 OF_THE_FILE = ("attribute", "color", "texture")

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from torch.nn import functional
 
 from styleexp.inputs.images import is_normal_map, luminance
 from styleexp.method.relief import half_range
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
-    from styleexp.config.schema import Config, StyleConfig
+    from styleexp.method.options import StyleConfig
 
 DEPTH = 0.1
 """Default of ``style.image_depth``."""
@@ -49,25 +50,27 @@ class Heights:
         return self.kind != "photo"
 
 
-def kind_of(config: Config, picture: Float[np.ndarray, "height width 3"]) -> str:
+def kind_of(kind: str, picture: Float[np.ndarray, "height width 3"], as_tone: bool = False) -> str:
     """Resolve ``style.kind``. ``auto`` detects a normal map by its colours, and the direction of
-    green by which one integrates better. For methods that compare renders with the image's tone,
-    ``auto`` is ``photo``."""
-    if config.style.kind != "auto":
-        return config.style.kind
-    if config.baseline is None or not is_normal_map(picture):
+    green by which one integrates better; with ``as_tone``, for methods that compare renders with
+    the image's tone, it is ``photo``."""
+    if kind != "auto":
+        return kind
+    if as_tone or not is_normal_map(picture):
         return "photo"
     misfit = [integrated(*slopes(picture, down))[1] for down in (False, True)]
     return "normal_dx" if misfit[1] < 0.9 * misfit[0] else "normal"
 
 
-def picture_height(config: Config, picture: Float[np.ndarray, "height width 3"]) -> Heights:
-    """The image's heights, according to ``style.kind``, ``style.image_depth`` and ``style.invert``.
+def picture_height(
+    style: StyleConfig, picture: Float[np.ndarray, "height width 3"], as_tone: bool = False
+) -> Heights:
+    """The image's heights, according to ``style.kind`` (see `kind_of`), ``style.image_depth`` and
+    ``style.invert``.
 
     Raises `UserError` for an image without relief, or one that doesn't match its kind.
     """
-    style = config.style
-    kind = kind_of(config, picture)
+    kind = kind_of(style.kind, picture, as_tone)
     _check(style, kind, picture)
     if kind.startswith("normal"):
         found, _ = integrated(*slopes(picture, kind == "normal_dx"))
@@ -151,3 +154,12 @@ def _tiles(*columns: np.ndarray) -> bool:
     """Whether the last column continues into the first."""
     inner = sum(np.abs(np.diff(each, axis=1)).mean() for each in columns)
     return sum(np.abs(each[:, 0] - each[:, -1]).mean() for each in columns) <= SEAM * inner
+
+
+def resized(
+    picture: Float[Tensor, "height width"], longer_side: float
+) -> Float[Tensor, "rows columns"]:
+    """Resize an image to about ``longer_side`` pixels on its longer side, with antialiasing."""
+    factor = longer_side / max(picture.shape)
+    shape = [max(8, round(side * factor)) for side in picture.shape]
+    return functional.interpolate(picture[None, None], shape, mode="bilinear", antialias=True)[0, 0]

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from styleexp.inputs import meshes
+
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from torch import Tensor
@@ -87,3 +89,16 @@ def sample_surface(
     picked = surface.faces[chosen.to(surface.faces.device)]
     normal = (surface.normals[picked] * mix).sum(1)
     return (surface.vertices[picked] * mix).sum(1), torch.nn.functional.normalize(normal, dim=1)
+
+
+def normalised(mesh: meshes.Mesh, device: torch.device) -> tuple[meshes.Normalisation, Surface]:
+    """The mesh in the unit sphere, on the device (Sec. 4.1)."""
+    frame = meshes.normalisation(mesh.vertices)
+    vertices = frame.apply(mesh.vertices)
+    normals = meshes.vertex_normals(vertices, mesh.faces)
+    surface = Surface(
+        torch.from_numpy(vertices).float().to(device),
+        torch.from_numpy(mesh.faces).to(device),
+        torch.from_numpy(normals).float().to(device),
+    )
+    return frame, surface

@@ -1,4 +1,5 @@
-"""Style sources: a mesh or an image, converted to target Gram matrices (Sec. 4.2)."""
+"""The style as what the loss compares with: statistics of its views, such as Gram matrices (Sec.
+4.2)."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 import torch
 from torch.nn import functional
 
-from styleexp.method import views
+from styleexp.method import pictures, views
 from styleexp.method.viewer import Images
 
 if TYPE_CHECKING:
@@ -17,8 +18,8 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
-    from styleexp.config.schema import Config, StyleConfig, ViewsConfig
-    from styleexp.method.losses import Grams, StyleLoss
+    from styleexp.method.losses import Loss, Statistics
+    from styleexp.method.options import Settings, StyleConfig, ViewsConfig
     from styleexp.method.viewer import Viewer
 
 BANK_STEP = 1_000_000
@@ -28,57 +29,59 @@ OWN_VIEWS = 2_000_000
 
 
 class StyleTarget(Protocol):
-    """Target Grams of a step, for global and local views."""
+    """Target Statistics of a step, for global and local views."""
 
-    def __call__(self, step: int) -> tuple[Grams, Grams]:
-        """The Grams for this step."""
+    def __call__(self, step: int) -> tuple[Statistics, Statistics]:
+        """The Statistics for this step."""
         ...
 
 
 class FixedTarget:
-    """Constant Grams, averaged over a bank of views of the style."""
+    """Constant Statistics, averaged over a bank of views of the style."""
 
-    def __init__(self, whole: Grams, local: Grams):
-        self.grams = whole, local
+    def __init__(self, whole: Statistics, local: Statistics):
+        self.statistics = whole, local
 
-    def __call__(self, step: int) -> tuple[Grams, Grams]:
-        """The constant Grams, for any step."""
-        return self.grams
+    def __call__(self, step: int) -> tuple[Statistics, Statistics]:
+        """The constant Statistics, for any step."""
+        return self.statistics
 
 
 class RenderedTarget:
-    """Grams of the style mesh, rendered in every step: at the generated mesh's views, as in the
+    """Statistics of the style mesh, rendered in every step: at the generated mesh's views, as in the
     paper, or at those of ``later`` steps, so that the two see different views."""
 
     def __init__(
-        self, loss: StyleLoss, viewer: Viewer, vertices: Float[Tensor, "vertices 3"], later: int = 0
+        self, loss: Loss, viewer: Viewer, vertices: Float[Tensor, "vertices 3"], later: int = 0
     ):
         self.loss, self.viewer, self.vertices, self.later = loss, viewer, vertices, later
 
     @torch.no_grad()
-    def __call__(self, step: int) -> tuple[Grams, Grams]:
-        """Grams of the style mesh at this step's views."""
+    def __call__(self, step: int) -> tuple[Statistics, Statistics]:
+        """Statistics of the style mesh at this step's views."""
         whole, local = self.viewer(self.vertices, step + self.later)
-        return self.loss.grams(whole), self.loss.grams(local)
+        return self.loss.describe(whole), self.loss.describe(local)
 
 
-def mean_grams(loss: StyleLoss, batches: Iterator[tuple[Images, Images]]) -> tuple[Grams, Grams]:
-    """Grams of global and local views, averaged over batches."""
+def mean_statistics(
+    loss: Loss, batches: Iterator[tuple[Images, Images]]
+) -> tuple[Statistics, Statistics]:
+    """Statistics of global and local views, averaged over batches."""
     with torch.no_grad():
-        pairs = [(loss.grams(whole), loss.grams(local)) for whole, local in batches]
+        pairs = [(loss.describe(whole), loss.describe(local)) for whole, local in batches]
     return _mean([g for g, _ in pairs]), _mean([g for _, g in pairs])
 
 
-def mesh_grams(
-    loss: StyleLoss, viewer: Viewer, vertices: Float[Tensor, "vertices 3"]
-) -> tuple[Grams, Grams]:
-    """Grams of a mesh, averaged over a bank of its views."""
-    batches = max(1, round(loss.config.bank_views / viewer.config.count))
-    return mean_grams(loss, (viewer(vertices, BANK_STEP + batch) for batch in range(batches)))
+def mesh_statistics(
+    loss: Loss, viewer: Viewer, vertices: Float[Tensor, "vertices 3"], bank_views: int
+) -> tuple[Statistics, Statistics]:
+    """Statistics of a mesh, averaged over a bank of about ``bank_views`` global views."""
+    batches = max(1, round(bank_views / viewer.config.count))
+    return mean_statistics(loss, (viewer(vertices, BANK_STEP + batch) for batch in range(batches)))
 
 
 def image_bank(
-    picture: Float[Tensor, "height width"], config: Config, unit: float
+    picture: Float[Tensor, "height width"], config: Settings, unit: float
 ) -> Iterator[tuple[Images, Images]]:
     """Windows of a style image, at the texel density of the result's views.
 
@@ -104,7 +107,7 @@ def image_bank(
 
 
 def whole_image_bank(
-    picture: Float[Tensor, "height width"], config: Config
+    picture: Float[Tensor, "height width"], config: Settings
 ) -> Iterator[tuple[Images, Images]]:
     """As in the paper: the image is the global view, and local views are its crops; with
     ``loss.target=whole`` local views are also the whole image."""
@@ -121,7 +124,7 @@ def whole_image_bank(
         yield _all_seen(image), _all_seen(cut)
 
 
-def _batches(config: Config) -> Iterator[torch.Generator]:
+def _batches(config: Settings) -> Iterator[torch.Generator]:
     for batch in range(max(1, round(config.loss.bank_views / config.views.count))):
         yield views.step_generator(config.optim.seed, BANK_STEP + batch, stream=2)
 
@@ -141,15 +144,6 @@ def tone(
         contrast = style.image_contrast / float(picture.std().clamp(min=1e-6))
     goal = mean if style.image_match_mean else float(centre)
     return ((picture - centre) * contrast + goal).clamp(0, 1)
-
-
-def resized(
-    picture: Float[Tensor, "height width"], longer_side: float
-) -> Float[Tensor, "rows columns"]:
-    """Resize an image to about ``longer_side`` pixels on its longer side, with antialiasing."""
-    factor = longer_side / max(picture.shape)
-    shape = [max(8, round(side * factor)) for side in picture.shape]
-    return functional.interpolate(picture[None, None], shape, mode="bilinear", antialias=True)[0, 0]
 
 
 def global_texels(config: ViewsConfig) -> float:
@@ -176,7 +170,7 @@ def picture_windows(
 ) -> Images:
     """``count`` square windows of ``size`` pixels at random positions in an image resized to
     ``longer_side`` pixels and mirrored at its borders."""
-    shown = resized(picture, longer_side)
+    shown = pictures.resized(picture, longer_side)
     height, width = shown.shape
     cut = []
     for dy, dx in torch.rand(count, 2, generator=generator).tolist():
@@ -191,5 +185,5 @@ def _mirrored(start: int, count: int, size: int, device: torch.device) -> Tensor
     return torch.where(index < size, index, 2 * size - 1 - index)
 
 
-def _mean(batches: list[Grams]) -> Grams:
+def _mean(batches: list[Statistics]) -> Statistics:
     return [torch.stack(layer).mean(0) for layer in zip(*batches, strict=True)]

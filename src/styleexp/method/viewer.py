@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
-    from styleexp.config.schema import Config
+    from styleexp.method.options import ViewsConfig
     from styleexp.method.surface import Surface
     from styleexp.renderers.base import Cameras, Renderer, Shading
 
@@ -28,28 +28,34 @@ class Images:
     image: Float[Tensor, "n height width channels"]
     coverage: Float[Tensor, "n height width"]
 
+    def blank(self) -> int:
+        """Number of images that don't show the mesh at all."""
+        return int((self.coverage.flatten(1).amax(1) <= 0).sum())
+
 
 class Viewer:
     """Renders a mesh's views for any step; equal seeds give equal views.
 
     ``scale`` magnifies the mesh: showing the style larger makes its pattern larger on the result.
     Images have one channel per light; the ``lights`` are evenly spaced about the viewing axis,
-    starting with that of ``shading``.
+    starting with that of ``shading``, and fixed in the ``camera`` or in the ``world``.
     """
 
     def __init__(
         self,
-        config: Config,
+        config: ViewsConfig,
         renderer: Renderer,
         shading: Shading,
         surface: Surface,
+        *,
+        seed: int = 0,
         scale: float = 1.0,
         lights: int = 1,
+        light_frame: str = "camera",
     ):
-        self.config = config.views
-        self.light_spread = config.shading.light_spread
-        self.light_frame = config.shading.light_frame
-        self.seed = config.optim.seed
+        self.config = config
+        self.light_frame = light_frame
+        self.seed = seed
         self.renderer = renderer
         self.shading = shading
         self.lights = lights
@@ -72,15 +78,14 @@ class Viewer:
         cameras = views.sample_global(self.config, generator, vertices.device)
         cameras = views.zoom(cameras, self.scale)
         size = self.config.resolution
-        whole = self._render(vertices, cameras, size, generator)
+        whole = self._render(vertices, cameras, size)
         warped = self._perspective(whole, generator)
         cut_from = warped if self.config.local.perspective == "before" else whole
-        return warped, self._local(vertices, cameras, cut_from, generator)
+        return warped, self._local(vertices, cut_from, generator)
 
     def _local(
         self,
         vertices: Float[Tensor, "vertices 3"],
-        cameras: Cameras,
         whole: Images,
         generator: torch.Generator,
     ) -> Images:
@@ -88,36 +93,22 @@ class Viewer:
         if self.surface_cameras is not None:
             bank = self.surface_cameras
             chosen = torch.randint(len(bank), (count * local.per_view,), generator=generator)
-            return self._render(vertices, bank[chosen], local.size, generator)
+            return self._render(vertices, bank[chosen], local.size)
         windows, view = views.crop_windows(local, count, generator)
         windows, view = windows.to(vertices), view.to(vertices.device)
-        if local.mode == "zoom":
-            zoomed = views.crop_cameras(cameras, windows, view)
-            return self._render(vertices, zoomed, local.size, generator)
         cut = views.crop_images(
             torch.cat([whole.image, whole.coverage[..., None]], dim=-1), windows, view, local.size
         )
         seen = Images(cut[..., :-1], cut[..., -1])
         return seen if local.perspective == "before" else self._perspective(seen, generator)
 
-    def _render(
-        self,
-        vertices: Float[Tensor, "vertices 3"],
-        cameras: Cameras,
-        size: int,
-        generator: torch.Generator,
-    ) -> Images:
-        turn = torch.zeros(len(cameras))
-        if self.light_spread > 0:
-            turn = self.light_spread * (2 * torch.rand(len(cameras), generator=generator) - 1)
-        lights = torch.stack(
-            [turned_light(self.shading, turn + 360 * i / self.lights) for i in range(self.lights)]
-        )
+    def _render(self, vertices: Float[Tensor, "vertices 3"], cameras: Cameras, size: int) -> Images:
+        turns = [torch.full((len(cameras),), 360 * i / self.lights) for i in range(self.lights)]
+        lights = torch.stack([turned_light(self.shading, turn) for turn in turns])
         if self.light_frame == "world":
             lights = torch.einsum("vij,lvj->lvi", cameras.rotation, lights.to(cameras.rotation))
-        out = self.renderer.render_lights(
-            vertices, self.faces, cameras, self.shading, lights, (size, size)
-        )
+        shading = replace(self.shading, light=lights)
+        out = self.renderer.render(vertices, self.faces, cameras, shading, (size, size))
         return Images(out.image, out.coverage)
 
     def _perspective(self, seen: Images, generator: torch.Generator) -> Images:

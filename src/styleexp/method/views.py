@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from torch import Tensor
 
-    from styleexp.config.schema import LocalViewsConfig, ViewsConfig
+    from styleexp.method.options import LocalViewsConfig, ViewsConfig
     from styleexp.method.surface import Surface
     from styleexp.renderers.base import Renderer, Shading
 
@@ -97,18 +97,6 @@ def sample_global(
 def zoom(cameras: Cameras, factor: float) -> Cameras:
     """Zoom in: everything appears ``factor`` times as large."""
     return replace(cameras, focal=cameras.focal * factor)
-
-
-def crop_cameras(
-    cameras: Cameras, windows: Float[Tensor, "crops 3"], view: Int[Tensor, " crops"]
-) -> Cameras:
-    """Cameras that see only a window of a view: rows are (x, y, share), the centre in NDC and the
-    side as a fraction of the frame."""
-    parent = cameras[view]
-    share = windows[:, 2:3]
-    return replace(
-        parent, focal=parent.focal / share, center=(parent.center - windows[:, :2]) / share
-    )
 
 
 def crop_windows(

@@ -29,15 +29,13 @@ from functools import cache, partial
 from typing import Any
 
 from styleexp import __version__
-from styleexp.config.schema import EncoderConfig, FieldConfig, LossConfig, StyleConfig
-from styleexp.encoders.specs import ENCODERS
+from styleexp.encoders.options import EncoderConfig
 from styleexp.inputs import assets
-from styleexp.method.baselines.specs import BASELINES
+from styleexp.method.options import FieldConfig, LossConfig, StyleConfig
 from styleexp.plugins import catalogue
 from styleexp.plugins.spec import Spec
-from styleexp.renderers.specs import RENDERERS
-from styleexp.runs.loggers.specs import LOGGERS
 from styleexp.system.errors import UserError, unknown_name
+from styleexp.system.options import check
 
 VARIABLE = "STYLEEXP_PLUGINS"
 OWN = "styleexp"
@@ -56,13 +54,13 @@ class Kind:
 
 
 KINDS = {
-    "renderer": Kind("styleexp.renderers", RENDERERS),
-    "encoder": Kind("styleexp.encoders", ENCODERS, EncoderConfig),
+    "renderer": Kind("styleexp.renderers", catalogue.RENDERERS),
+    "encoder": Kind("styleexp.encoders", catalogue.ENCODERS, EncoderConfig),
     "style": Kind("styleexp.styles", catalogue.STYLES, StyleConfig),
     "field": Kind("styleexp.fields", catalogue.FIELDS, FieldConfig),
     "loss": Kind("styleexp.losses", catalogue.LOSSES, LossConfig),
-    "baseline": Kind("styleexp.baselines", BASELINES),
-    "logger": Kind("styleexp.loggers", LOGGERS),
+    "baseline": Kind("styleexp.baselines", catalogue.BASELINES),
+    "logger": Kind("styleexp.loggers", catalogue.LOGGERS),
 }
 
 
@@ -181,6 +179,23 @@ def build(kind: str, options: Any, **given: Any) -> Any:
             f"the {kind} '{name}' of {choice.origin} failed: {_told(error)} (debug=true shows the "
             "traceback)."
         ) from error
+
+
+def load_encoder(name: str, *, device: str = "cpu", seed: int = 0, **options: Any) -> Any:
+    """Load an encoder; the first use of a pretrained one downloads its weights.
+
+    Args:
+        name: a built-in encoder, or a plugin's. There is no silent fallback.
+        device: torch device.
+        seed: for random encoders only; the global random state is not touched.
+        options: fields of its options, such as ``precision="fp32"``; see `EncoderConfig`.
+
+    Raises:
+        UserError: unknown name or value; weights that can be neither found nor downloaded.
+    """
+    chosen = find("encoder", name).spec.config(name=name, **options)
+    check({"encoder": chosen})
+    return build("encoder", chosen, device=device, seed=seed)
 
 
 # -------------------------------------------------------------------------------------- discovery

@@ -12,18 +12,21 @@ from typing import Any
 class Spec:
     """One choice of a kind of part, built in or from a plugin.
 
-    Signature of the factory, and type of ``config``:
+    Signature of the factory, type of ``config``, and what it returns:
 
-    - renderer: ``factory(options)``; any dataclass.
-    - encoder: ``factory(options, device=, seed=)``; ``config.EncoderConfig`` or a subclass.
-    - style: ``factory(options)``; ``config.StyleConfig`` or a subclass. Returns a mesh, or an image
-      of shape (height, width, 3) in [0, 1].
-    - field: ``factory(options, generator=, sigma=, bound=)``; ``config.FieldConfig`` or a subclass.
-    - loss: ``factory(options, encoder=)``; ``config.LossConfig`` or a subclass.
-    - baseline: ``factory(options)``; any dataclass. Returns a `baselines.Method`.
-    - logger: ``factory(options, folder=, record=, step=)``; any dataclass. Returns a
-      `loggers.Logger` for the run in that folder, whose ``run.json`` is ``record``, starting at
-      ``step``.
+    - renderer: ``factory(options)``; any dataclass. A `renderers.base.Renderer`.
+    - encoder: ``factory(options, device=, seed=)``; an `EncoderConfig`. An
+      `encoders.base.Encoder`.
+    - style: ``factory(options)``; a `StyleConfig`. A mesh, or an image of shape (height, width, 3)
+      in [0, 1].
+    - field: ``factory(options, points=, generator=, sigma=, bound=)``; a `FieldConfig`. A
+      `method.fields.Field`.
+    - loss: ``factory(options, encoder=)``; a `LossConfig`. A `method.losses.Loss`.
+    - baseline: ``factory(options)``; any dataclass. A `method.base.Method`.
+    - logger: ``factory(options, folder=, record=, step=)``; any dataclass. A `loggers.Logger` for
+      the run in that folder, whose ``run.json`` is ``record``, starting at ``step``.
+
+    ``config`` may add fields to the class named, and limits with `system.options.option`.
     """
 
     name: str

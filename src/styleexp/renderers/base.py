@@ -19,15 +19,17 @@ front of the camera. Faces wind counter-clockwise seen from outside; back faces 
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
 import torch
+from torch import Tensor
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
-    from torch import Tensor
 
 
 @dataclass(frozen=True)
@@ -67,8 +69,9 @@ class Shading:
 
     albedo: float = 0.5
     ambient: float = 0.28209
-    light: Float[Tensor, "views 3"] | tuple[float, float, float] = (0.48860, 0.48860, 0.48860)
-    """Camera-space direction times strength; a tensor sets one light per view."""
+    light: Float[Tensor, "*lights views 3"] | tuple[float, float, float] = (0.4886, 0.4886, 0.4886)
+    """Camera-space direction times strength. A tensor of shape (views, 3) sets one light per view;
+    (lights, views, 3) renders one channel of the image under each light."""
     background: float = 1.0
     normals: str = "flat"
     """``flat`` (one normal per face) or ``smooth`` (interpolated area-weighted vertex normals)."""
@@ -82,7 +85,8 @@ class RenderOutput:
     """Output of a backend. Only ``image`` and ``coverage`` are guaranteed."""
 
     image: Float[Tensor, "views height width channels"]
-    """Image in [0, 1], with one (grey) or three channels (RGB)."""
+    """Image in [0, 1]: one channel per light, or, under a single light, one (grey) or three
+    (RGB)."""
     coverage: Float[Tensor, "views height width"]
     """1 where the mesh covers the pixel, 0 on the background, in between along anti-aliased
     outlines. Has gradients if the backend differentiates visibility."""
@@ -118,30 +122,43 @@ class Renderer(ABC):
         shading: Shading,
         resolution: tuple[int, int],
     ) -> RenderOutput:
-        """Render one mesh from every camera.
+        """Render one mesh from every camera. The only entry: everything that is rendered comes
+        here.
 
-        ``resolution`` is (height, width) in pixels. Gradients flow from ``image`` (and, with
-        visibility gradients, ``coverage``) to ``vertices``. An empty mesh renders the background.
+        ``resolution`` is (height, width) in pixels. ``shading.light`` may hold several lights; a
+        backend that shades with one at a time is decorated with `one_light_at_a_time`. Gradients
+        flow from ``image`` (and, with visibility gradients, ``coverage``) to ``vertices``. An empty
+        mesh renders the background.
         """
 
-    def render_lights(
-        self,
+
+def lights_of(shading: Shading, cameras: Cameras, like: Tensor) -> Float[Tensor, "lights views 3"]:
+    """``shading.light`` with all three axes, on the device and of the dtype of ``like``."""
+    light = torch.as_tensor(shading.light).to(like)
+    return light if light.ndim == 3 else light.expand(1, len(cameras), 3)
+
+
+def one_light_at_a_time(render: Callable[..., RenderOutput]) -> Callable[..., RenderOutput]:
+    """Decorate the ``render`` method of a backend that shades with one light: it is called once for
+    each of several. Of an RGB backend's images the first light gives red, the second green, the
+    third blue."""
+
+    @functools.wraps(render)
+    def under_each_light(
+        self: Renderer,
         vertices: Float[Tensor, "vertices 3"],
         faces: Int[Tensor, "faces 3"],
         cameras: Cameras,
         shading: Shading,
-        lights: Float[Tensor, "lights views 3"],
         resolution: tuple[int, int],
     ) -> RenderOutput:
-        """Render under several lights, one per channel.
-
-        ``lights`` replace ``shading.light``. The default renders once per light; backends may share
-        light-independent work.
-        """
+        if not isinstance(shading.light, Tensor) or shading.light.ndim < 3:
+            return render(self, vertices, faces, cameras, shading, resolution)
         outs = [
-            self.render(vertices, faces, cameras, replace(shading, light=light), resolution)
-            for light in lights
+            render(self, vertices, faces, cameras, replace(shading, light=light), resolution)
+            for light in shading.light
         ]
-        # With an RGB backend, each light uses one channel: red, green, blue.
         channels = [out.image[..., min(i, out.image.shape[-1] - 1)] for i, out in enumerate(outs)]
         return replace(outs[0], image=torch.stack(channels, dim=-1))
+
+    return under_each_light

@@ -27,7 +27,14 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from styleexp.renderers import llvm
-from styleexp.renderers.base import Cameras, Capabilities, Renderer, RenderOutput, Shading
+from styleexp.renderers.base import (
+    Cameras,
+    Capabilities,
+    Renderer,
+    RenderOutput,
+    Shading,
+    one_light_at_a_time,
+)
 from styleexp.renderers.soft_raster.geometry import FaceNormals, unit, vertex_normals
 from styleexp.renderers.soft_raster.raster import facing
 from styleexp.renderers.soft_raster.shading import world_light
@@ -75,6 +82,7 @@ class MitsubaAD(Renderer):
         self.spp, self.sppc = _divisible(spp), _divisible(sppc)
         self.sppp, self.seed = sppp, seed
 
+    @one_light_at_a_time
     def render(
         self,
         vertices: Float[Tensor, "vertices 3"],

@@ -10,25 +10,13 @@ import hashlib
 import json
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from styleexp.config.schema import Config
-
-FILES = ("source", "style")
-"""Configuration sections that may name a file."""
-
-
-@dataclass(frozen=True)
-class Named:
-    """A possible file of a run: one of `FILES`, or an image in ``style.mask``."""
-
-    name: str | None
-    path: str | None
-
 
 ABSENT = "not found"
 """Placeholder for the sha256 of a missing file."""
@@ -49,7 +37,7 @@ def job_key(config: Config) -> str:
     from styleexp.system.errors import UserError
 
     files = {}
-    for kind, part in parts(config).items():
+    for kind, part in sources.parts(config).items():
         try:
             path = sources.locate(kind, part.name, part.path)
             files[kind] = sha256(path) if path else None
@@ -58,23 +46,12 @@ def job_key(config: Config) -> str:
     return _hash(asdict(config), files, __version__)
 
 
-def parts(config: Config) -> dict[str, Named]:
-    """Possible files of a run, keyed ``source``, ``style`` and, for each image in ``style.mask``,
-    ``mask``, ``mask 2`` and so on."""
-    from styleexp.method import masks
-
-    found = {kind: Named(getattr(config, kind).name, getattr(config, kind).path) for kind in FILES}
-    for k, path in enumerate(masks.files(config.style.mask), 1):
-        found["mask" if k == 1 else f"mask {k}"] = Named(None, path)
-    return found
-
-
 def of(record: Mapping[str, Any]) -> str | None:
     """Key of a recorded run; None for records of earlier versions that lack it."""
     if isinstance(told := record.get("key"), str):
         return told
     try:
-        files = {kind: record["assets"][kind]["sha256"] for kind in FILES}
+        files = {kind: record["assets"][kind]["sha256"] for kind in ("source", "style")}
         return _hash(record["config"], files, record["versions"]["styleexp"])
     except (KeyError, TypeError, AttributeError):
         return None

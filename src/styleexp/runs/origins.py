@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 def describe(config: Config) -> dict[str, dict[str, str | None]]:
     """Name, absolute path and sha256 of the source, the style and the mask's images, keyed as in
-    `identity.parts`, for the run's record. Analytic shapes have no file; the package version
+    `sources.parts`, for the run's record. Analytic shapes have no file; the package version
     defines them. Raises `UserError` for a missing file."""
     found = {}
-    for kind, part in identity.parts(config).items():
+    for kind, part in sources.parts(config).items():
         path = sources.locate(kind, part.name, part.path)
         digest = identity.sha256(path) if path else None
         if digest == identity.ABSENT:
@@ -76,12 +76,12 @@ def restored(
 
     config = compose.recorded(record.get("config"))
     pictures = []
-    for kind in identity.parts(config):
+    for kind in sources.parts(config):
         try:
             path = find(record, config, kind, folder, tell)
         except UserError as error:
             raise UserError(f"cannot {purpose} '{folder}': {error}") from None
-        if path is not None and kind in identity.FILES:
+        if path is not None and kind in sources.FILES:
             getattr(config, kind).path = str(path)
         elif path is not None:
             pictures.append(str(path))
@@ -100,7 +100,7 @@ def find(
 
     Raises `UserError`, whose message lacks the subject, for a file that has changed or is missing.
     """
-    part = identity.parts(config)[kind]
+    part = sources.parts(config)[kind]
     told = (record.get("assets") or {}).get(kind) or {}
     digest = told.get("sha256")
     if digest is None:

@@ -25,7 +25,6 @@ from PIL import Image, ImageDraw, ImageFont
 
 from styleexp import plugins
 from styleexp.inputs import meshes
-from styleexp.method.scene import Scene
 from styleexp.method.views import orbit, zoom
 from styleexp.renderers.base import Cameras, Renderer, Shading
 from styleexp.renderers.soft_raster import SoftRaster
@@ -35,7 +34,8 @@ from styleexp.system.errors import UserError
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-    from styleexp.method.gram import Result
+    from styleexp.config.schema import Config
+    from styleexp.method.base import Result
 
 VIEWS = (
     ("front left", 15.0, 35.0),
@@ -93,39 +93,36 @@ def framed(
     return zoom(cameras, 0.94 / float(reach))
 
 
-def write_preview(result: Result, path: Path) -> None:
-    """Draw source, style and result, four labelled views each; an image style is shown as is."""
-    scene, size = result.scene, result.scene.config.preview.resolution
+def write_preview(result: Result, size: int, path: Path) -> None:
+    """Draw source, style and result, four labelled views each of ``size`` pixels;
+    an image style is shown as is."""
+    subject, style = result.subject, result.subject.style
     elevations, azimuths = [v[1] for v in VIEWS], [v[2] for v in VIEWS]
 
     def shown(vertices: np.ndarray, faces: np.ndarray) -> list[Image.Image]:
         pictures = render_views(vertices, faces, elevations, azimuths, size)
         return [Image.fromarray(p) for p in pictures]
 
-    source = scene.frame.apply(scene.source.vertices)
-    rows = [(f"source: {scene.source.name}", shown(source, scene.source.faces))]
-    if isinstance(scene.style, meshes.Mesh):
-        style = meshes.normalisation(scene.style.vertices).apply(scene.style.vertices)
-        rows.append((f"style: {scene.style.name}", shown(style, scene.style.faces)))
+    source = subject.frame.apply(subject.source.vertices)
+    rows = [(f"source: {subject.source.name}", shown(source, subject.source.faces))]
+    if style.mesh is not None:
+        vertices = meshes.normalisation(style.mesh.vertices).apply(style.mesh.vertices)
+        rows.append((f"style: {style.mesh.name}", shown(vertices, style.mesh.faces)))
     else:
-        picture = Image.fromarray((scene.style * 255).round().astype(np.uint8)).convert("L")
+        assert style.picture is not None
+        picture = Image.fromarray((style.picture * 255).round().astype(np.uint8)).convert("L")
         picture.thumbnail((size, size))
-        chosen = scene.config.style
-        rows.append((f"style: {Path(chosen.path or str(chosen.name)).stem}", [picture]))
-    generated = scene.frame.apply(result.vertices)
-    rows.append(("result", shown(generated, scene.source.faces)))
+        rows.append((f"style: {Path(style.name).stem}", [picture]))
+    generated = subject.frame.apply(result.vertices)
+    rows.append(("result", shown(generated, subject.source.faces)))
     sheet(rows, size).save(path)
 
 
-def write_turntable(result: Result, path: Path) -> None:
+def write_turntable(result: Result, frames: int, size: int, path: Path) -> None:
     """Draw one turn of the result, as an animated GIF."""
-    preview = result.scene.config.preview
-    frames = preview.turntable_frames
     azimuths = [360.0 * i / frames for i in range(frames)]
-    generated = result.scene.frame.apply(result.vertices)
-    pictures = render_views(
-        generated, result.scene.source.faces, [15.0] * frames, azimuths, preview.resolution
-    )
+    generated = result.subject.frame.apply(result.vertices)
+    pictures = render_views(generated, result.faces, [15.0] * frames, azimuths, size)
     _write_gif(pictures, path)
 
 
@@ -246,25 +243,24 @@ def silhouette_iou(
     return np.where(either > 0, both / np.maximum(either, 1), 1.0).tolist(), own
 
 
-def write_check(result: Result, write: Callable[[str, Callable[[Path], Any]], Path]) -> list[Path]:
+def write_check(
+    result: Result, config: Config, write: Callable[[str, Callable[[Path], Any]], Path]
+) -> list[Path]:
     """Write ``check.png``, ``check.gif`` and ``check.json``: the result drawn by pyrender.
 
     ``write`` is ``RunFolder.write``. The training renderer's silhouettes are compared with
     pyrender's at the same cameras; ``check.json`` holds the IoUs, and one below ``LEAST_IOU``
     issues a warning. Returns the files' paths.
     """
-    scene, preview = result.scene, result.scene.config.preview
-    faces = scene.source.faces
-    vertices = scene.frame.apply(result.vertices)
+    subject, preview = result.subject, config.preview
+    faces = result.faces
+    vertices = subject.frame.apply(result.vertices)
     points = torch.from_numpy(np.ascontiguousarray(vertices)).float()
     frames = preview.turntable_frames
     elevations = [v[1] for v in VIEWS] + [15.0] * frames
     azimuths = [v[2] for v in VIEWS] + [360.0 * i / frames for i in range(frames)]
     cameras = framed(points, elevations, azimuths)
-    if isinstance(scene, Scene):
-        renderer = scene.viewer.renderer
-    else:  # a baseline may have no renderer
-        renderer = plugins.build("renderer", scene.config.renderer)
+    renderer = plugins.build("renderer", config.renderer)
     size, views = preview.check_resolution, slice(0, len(VIEWS))
     drawn = check_views(vertices, faces, cameras, size, preview.platform)
     ious, own = silhouette_iou(
@@ -273,10 +269,10 @@ def write_check(result: Result, write: Callable[[str, Callable[[Path], Any]], Pa
         faces,
         cameras[views],
         renderer,
-        scene.surface.vertices.device,
+        subject.surface.vertices.device,
     )
 
-    name = scene.config.renderer.name
+    name = config.renderer.name
     found = {
         "least_iou": min(ious),
         "views": [

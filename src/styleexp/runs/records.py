@@ -25,7 +25,7 @@ from styleexp.system import atomic, digests
 from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
-    from styleexp.method.gram import State, Step
+    from styleexp.method.base import State, Step
 
 FILES = (
     "status.json",

@@ -8,14 +8,11 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from styleexp.config.schema import Config
 
 
-def prepare(config: Config) -> None:
-    """Set threads and global generators for a run, independent of earlier state.
+def prepare(threads: int, seed: int) -> None:
+    """Set torch's threads (0: all cores) and the global generators for a run, independent of
+    earlier state.
 
     Built-in parts use their own generators; plugins may not. Mitsuba's variant is set in every call
     of its renderer.
@@ -24,13 +21,13 @@ def prepare(config: Config) -> None:
     import torch
 
     default = _default_threads()  # read before it changes
-    threads = config.threads or default
+    threads = threads or default
     torch.set_num_threads(threads)
     if "drjit" in sys.modules:
         sys.modules["drjit"].set_thread_count(threads)
-    random.seed(config.optim.seed)
-    np.random.seed(config.optim.seed % 2**32)
-    torch.manual_seed(config.optim.seed)
+    random.seed(seed)
+    np.random.seed(seed % 2**32)
+    torch.manual_seed(seed)
 
 
 @cache
@@ -46,7 +43,7 @@ _restore: list[Callable[[], None]] = []
 
 
 @contextmanager
-def undisturbed(config: Config) -> Iterator[None]:
+def undisturbed(threads: int, seed: int) -> Iterator[None]:
     """`prepare`, and restore everything on exit.
 
     With concurrent threads, the last one to exit restores the state that the first one saved.
@@ -56,7 +53,7 @@ def undisturbed(config: Config) -> Iterator[None]:
         if _guests == 0:
             _restore = _kept()
         _guests += 1
-        prepare(config)
+        prepare(threads, seed)
     try:
         yield
     finally:

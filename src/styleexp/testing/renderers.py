@@ -289,8 +289,7 @@ def light_moves_with_the_camera(renderer: Renderer) -> None:
 
 
 def several_lights_are_several_pictures(renderer: Renderer) -> None:
-    """Each channel of `Renderer.render_lights`, and its gradient, equals `render` with that
-    light."""
+    """Under several lights each channel, and its gradient, equals a render with that light."""
     vertices, faces = bumpy_sphere(1)
     cameras = _cameras(2, spread=0.2)
     lights = torch.tensor([[0.5, 0.2, 0.4], [0.0, -0.4, 0.6], [-0.6, 0.1, 0.5]])
@@ -299,7 +298,8 @@ def several_lights_are_several_pictures(renderer: Renderer) -> None:
         shading = Shading(normals=normals, background=0.3)
         together, apart = vertices.clone().requires_grad_(), vertices.clone().requires_grad_()
         resolution = (48, 48)
-        out = renderer.render_lights(together, faces, cameras, shading, lights, resolution)
+        lit = replace(shading, light=lights)
+        out = renderer.render(together, faces, cameras, lit, resolution)
         assert out.image.shape == (2, 48, 48, 3)
         weights = torch.linspace(0, 1, out.image.numel()).view_as(out.image).sin()
         (out.image * weights).sum().backward()

@@ -49,8 +49,8 @@ def measure(overrides: Sequence[str], methods: Sequence[str], points: int, out: 
 def run(config: Config, points: int) -> list[Point]:
     """Run once and measure before the first step and at ``points`` steps, denser at the
     beginning."""
+    from styleexp.config import build
     from styleexp.experiments import metrics
-    from styleexp.method import baselines
 
     name = metrics.judge_name(config.metrics.judge, config.encoder.name)
     judge = metrics.load_judge(name, config.metrics.windows)
@@ -60,8 +60,7 @@ def run(config: Config, points: int) -> list[Point]:
     # Twice as dense at the beginning, where the distance falls fastest.
     stops = {round(total * (k / points) ** 1.5) for k in range(points + 1)} - {0} | {total}
     wall, cpu = time.perf_counter(), time.process_time()
-    method = baselines.method(config)
-    scene = method.prepare(config)
+    method, scene = build.prepare(config)
     state = method.start(scene)
     if state is None:
         raise UserError("a method without steps has no curve: choose another in --methods.")
@@ -71,7 +70,7 @@ def run(config: Config, points: int) -> list[Point]:
 
     def note() -> None:
         result = method.finish(scene, state)
-        source, style = result.scene.source, result.scene.style
+        source, style = result.subject.source, result.subject.style
         told = metrics.measure(config, source, style, result.vertices, source.faces, judge)
         kept = ("style_distance", "relief_distance", "silhouette_iou")
         times = {"step": state.step, "seconds": seconds, "cpu_seconds": cpu_seconds}

@@ -17,7 +17,7 @@ import torch
 from styleexp.experiments.bench.measuring import interleaved
 
 if TYPE_CHECKING:
-    from styleexp.encoders.vgg import Encoder
+    from styleexp.encoders.vgg import VGG
 
 Shape = tuple[int, int, int, int, int]
 """Images, input channels, output channels, height and width of a size-preserving 3x3
@@ -47,7 +47,7 @@ class Floor:
         return self.flops / max(self.rates.values())
 
 
-def encoder_floor(encoder: Encoder, calls: Iterable[Call], repeats: int = 3) -> Floor:
+def encoder_floor(encoder: VGG, calls: Iterable[Call], repeats: int = 3) -> Floor:
     """Lower bounds of a step that makes these encoder calls."""
     forward: Counter[Shape] = Counter()
     backward: Counter[Shape] = Counter()
@@ -78,7 +78,7 @@ def encoder_floor(encoder: Encoder, calls: Iterable[Call], repeats: int = 3) -> 
     )
 
 
-def convolutions(encoder: Encoder, images: tuple[int, ...], layers: Iterable[str]) -> list[Shape]:
+def convolutions(encoder: VGG, images: tuple[int, ...], layers: Iterable[str]) -> list[Shape]:
     """The convolutions of a forward pass, up to the deepest layer."""
     deepest = max(layers, key=encoder.layer_names.index)
     names = encoder.layer_names[: encoder.layer_names.index(deepest) + 1]

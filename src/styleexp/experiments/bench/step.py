@@ -11,13 +11,13 @@ from typing import Any
 
 import torch
 
+from styleexp.config import build
 from styleexp.config.compose import compose
-from styleexp.encoders import Encoder
+from styleexp.encoders import VGG
 from styleexp.experiments.bench.floor import Call, encoder_floor
 from styleexp.experiments.bench.measuring import machine, peak_memory_mb
 from styleexp.experiments.bench.parts import BACKWARD, GRAMS, NORMALS, OTHER, Parts, timed_stages
-from styleexp.method import baselines
-from styleexp.method.scene import Scene
+from styleexp.method.scene import PaperScene
 from styleexp.runs.records import RunFolder
 from styleexp.system.errors import UserError
 
@@ -58,23 +58,20 @@ def measure(
     config = compose(overrides)
     if config.threads:
         torch.set_num_threads(config.threads)
-    method = baselines.method(config)
-    scene = method.prepare(config)
+    method, scene = build.prepare(config)
     state = method.start(scene)
-    if state is None or not isinstance(scene, Scene):
+    if state is None or not isinstance(scene, PaperScene):
         raise UserError("this method doesn't optimise a style loss: choose method=robust or paper.")
     config.optim.steps = max(config.optim.steps, steps + 2)
-    device = scene.surface.vertices.device
+    device = scene.subject.surface.vertices.device
 
-    clock, calls = Parts(device), _note_calls(scene.loss.encoder)
+    clock, calls = Parts(device), _note_calls(scene.encoder)
     clock.wrap("field", state, "field")
-    clock.wrap("field", state.field, "encode")
-    for name in ("render", "render_lights"):
-        clock.wrap("render", scene.viewer.renderer, name)
+    clock.wrap("render", scene.viewer.renderer, "render")
     clock.wrap("encoder", scene.loss, "encoder")
-    if hasattr(scene.loss.encoder, "gram_sums"):
-        clock.wrap("encoder", scene.loss.encoder, "gram_sums")
-    for name in ("grams", "distance"):
+    if hasattr(scene.encoder, "gram_sums"):
+        clock.wrap("encoder", scene.encoder, "gram_sums")
+    for name in ("describe", "distance"):
         clock.wrap("loss", scene.loss, name)
     for name in ("step", "zero_grad"):
         clock.wrap("optimiser", state.optimizer, name)
@@ -119,7 +116,7 @@ def _note_calls(encoder: Any) -> list[Call]:
     def note(images: torch.Tensor, layers: Iterable[str]) -> None:
         calls.append((tuple(images.shape), tuple(layers), images.requires_grad))
 
-    if isinstance(encoder, Encoder):
+    if isinstance(encoder, VGG):
         encoder.register_forward_pre_hook(lambda _, given: note(*given[:2]))
         sums = encoder.gram_sums
 
@@ -131,7 +128,7 @@ def _note_calls(encoder: Any) -> list[Call]:
     return calls
 
 
-def _told(rows: list[Any], scene: Scene, calls: list[Call], config: Any) -> dict[str, Any]:
+def _told(rows: list[Any], scene: PaperScene, calls: list[Call], config: Any) -> dict[str, Any]:
     names = [name for name in (*PARTS, OTHER) if any(name in row for row in rows)]
     names += sorted({name for row in rows for name in row} - set(names))
     wall, cpu = (
@@ -141,7 +138,7 @@ def _told(rows: list[Any], scene: Scene, calls: list[Call], config: Any) -> dict
     step_wall, step_cpu = (
         1e3 * median(sum(each[i] for each in row.values()) for row in rows) for i in (0, 1)
     )
-    encoder = scene.loss.encoder
+    encoder = scene.encoder
     told: dict[str, Any] = {
         "step_ms": step_wall,
         "step_cpu_ms": step_cpu,
@@ -152,7 +149,7 @@ def _told(rows: list[Any], scene: Scene, calls: list[Call], config: Any) -> dict
         "field_share": _share(wall, "field", step_wall),
         "field_share_cpu": _share(cpu, "field", step_cpu),
     }
-    if calls and scene.surface.vertices.device.type == "cpu":
+    if isinstance(encoder, VGG) and calls and scene.subject.surface.vertices.device.type == "cpu":
         floor = encoder_floor(encoder, calls)
         spent = cpu["encoder"] + cpu.get(f"encoder{BACKWARD}", 0.0)
         told |= {
@@ -162,14 +159,14 @@ def _told(rows: list[Any], scene: Scene, calls: list[Call], config: Any) -> dict
             "gflop_per_cpu_second": {k: v / 1e9 for k, v in floor.rates.items()},
         }
     return told | {
-        "vertices": len(scene.surface.vertices),
-        "faces": len(scene.surface.faces),
+        "vertices": len(scene.subject.surface.vertices),
+        "faces": len(scene.subject.surface.faces),
         "views": [list(shape[:3:2]) for shape, _, _ in calls],
         "steps": len(rows),
         "encoder": config.encoder.name,
-        "layers": list(scene.loss.layers),
+        "layers": list(getattr(scene.loss, "layers", ())),
         "dtype": getattr(encoder, "precision", "fp32"),
-        "device": str(scene.surface.vertices.device),
+        "device": str(scene.subject.surface.vertices.device),
         "threads": torch.get_num_threads(),
         "machine": machine(),
     }

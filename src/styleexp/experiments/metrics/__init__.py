@@ -21,13 +21,14 @@ from styleexp.experiments.metrics.style import (
 )
 from styleexp.inputs import meshes
 from styleexp.method.patches import Relief, closest, relief_of_mesh, relief_of_result
-from styleexp.method.scene import pattern_unit
+from styleexp.method.subject import pattern_unit
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
     from styleexp.config.schema import Config
     from styleexp.encoders import Encoder
+    from styleexp.inputs.style import Style
 
 
 @dataclass
@@ -47,9 +48,9 @@ class Judge:
         """Features of a result's relief, at positions independent of the run's seed."""
         return judged(relief, unit, self.encoder, self.windows, seed=config.optim.seed)
 
-    def style(self, config: Config, style: meshes.Mesh | np.ndarray, unit: float) -> Looks:
+    def style(self, config: Config, style: Style, unit: float) -> Looks:
         """Features of the style, cached per style and size."""
-        picture = isinstance(style, np.ndarray) and (unit, config.baseline is None)
+        picture = style.picture is not None and (unit, config.baseline is None)
         key = (repr(config.style), config.loss.target, picture)
         if key not in self.styles:
             self.styles[key] = judged_style(style, config, self.encoder, unit)
@@ -66,7 +67,7 @@ def judge_name(name: str, trained: str | None) -> str | None:
 
 def load_judge(name: str | None, windows: int) -> Judge | None:
     """Load the judge of that name; downloads its weights if needed."""
-    from styleexp.encoders import load_encoder
+    from styleexp.plugins import load_encoder
 
     return None if name is None else Judge(name, load_encoder(name), windows)
 
@@ -74,7 +75,7 @@ def load_judge(name: str | None, windows: int) -> Judge | None:
 def measure(
     config: Config,
     source: meshes.Mesh,
-    style: meshes.Mesh | np.ndarray,
+    style: Style,
     vertices: Float[np.ndarray, "vertices 3"],
     faces: Int[np.ndarray, "faces 3"],
     judge: Judge | None,
@@ -87,13 +88,13 @@ def measure(
     normalised source, and ``relief_share`` is its ratio to the style mesh's. For the content
     metrics, see ``metrics.shape``.
     """
-    unit = pattern_unit(config.style, source, style if isinstance(style, meshes.Mesh) else None)
+    unit = pattern_unit(config.style, source, style)
     found: dict[str, float] = {}
     relief = relief_of_result(source, vertices, faces, unit)
     found["relief_rms"] = _rms(relief.height)
-    if isinstance(style, meshes.Mesh):
+    if style.mesh is not None:
         found["relief_share"] = found["relief_rms"] / max(
-            unit * _rms(relief_of_mesh(style).height), 1e-12
+            unit * _rms(relief_of_mesh(style.mesh).height), 1e-12
         )
     if judge is not None:
         looks = judge.looks(config, relief, unit)

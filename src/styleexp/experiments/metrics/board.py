@@ -13,8 +13,9 @@ from styleexp.config.sources import load_source, load_style
 from styleexp.experiments.metrics import Judge, measure
 from styleexp.experiments.metrics.style import Looks, pattern_distance, relief_distance
 from styleexp.inputs import meshes
+from styleexp.inputs.style import Style
 from styleexp.method.patches import relief_of_result
-from styleexp.method.scene import pattern_unit
+from styleexp.method.subject import pattern_unit
 from styleexp.runs import origins, records
 from styleexp.system.errors import UserError
 
@@ -112,14 +113,14 @@ def relief_apart(result: Looks, style: Looks) -> float:
     return math.inf if apart is None else apart
 
 
-def unit_of(config: Config, source: meshes.Mesh, style: meshes.Mesh | np.ndarray) -> float:
+def unit_of(config: Config, source: meshes.Mesh, style: Style) -> float:
     """Size of a unit pattern on the normalised source."""
-    return pattern_unit(config.style, source, style if isinstance(style, meshes.Mesh) else None)
+    return pattern_unit(config.style, source, style)
 
 
 def _finished(
     folder: Path,
-) -> tuple[dict[str, Any], Config, meshes.Mesh, meshes.Mesh | np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[dict[str, Any], Config, meshes.Mesh, Style, np.ndarray, np.ndarray]:
     """Record, configuration, source, style and result of a finished run."""
     record = records.read_record(folder, "measure")
     try:

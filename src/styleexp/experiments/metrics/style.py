@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import torch
 from torch.nn import functional
 
-from styleexp.inputs import meshes
 from styleexp.method import pictures, targets
 from styleexp.method.losses import gram_matrix, layer_mask
 from styleexp.method.patches import SIZE, WINDOW, Relief, Windows, blurred, relief_of_mesh, windows
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
 
     from styleexp.config.schema import Config
     from styleexp.encoders import Encoder
-    from styleexp.method.losses import Grams
+    from styleexp.inputs.style import Style
 
 LAYERS = ("conv3_1", "conv4_1")
 """Judging layers. Shallower ones confused scales with other styles on the truth board; conv5_1 has
@@ -43,6 +42,10 @@ ENERGY_WEIGHT, SKEWNESS_WEIGHT = 0.3, 0.5
 """Weights that equalise the variation of the statistics between styles."""
 FLOOR = 1e-3
 """Lower bound for energies, as a fraction of the style's."""
+
+
+Grams: TypeAlias = "list[Tensor]"
+"""One Gram matrix per layer."""
 
 
 @dataclass(frozen=True)
@@ -89,16 +92,15 @@ def height_grams(encoder: Encoder, seen: Windows) -> Grams:
     return grams(encoder, (0.5 + HEIGHT_GAIN * seen.height).clamp(0, 1), seen.mask)
 
 
-def judged_style(
-    style: meshes.Mesh | np.ndarray, config: Config, encoder: Encoder, unit: float
-) -> Looks:
+def judged_style(style: Style, config: Config, encoder: Encoder, unit: float) -> Looks:
     """Features of the style itself. An image is treated as a photo of the shaded relief.
 
     ``unit`` is the pattern's size on the source; an image's size is a multiple of it.
     """
-    if isinstance(style, meshes.Mesh):
-        return judged(relief_of_mesh(style), 1.0, encoder, STYLE_WINDOWS)
-    return judged_picture(style, config, picture_span(config, unit) / unit, encoder)
+    if style.mesh is not None:
+        return judged(relief_of_mesh(style.mesh), 1.0, encoder, STYLE_WINDOWS)
+    assert style.picture is not None
+    return judged_picture(style.picture, config, picture_span(config, unit) / unit, encoder)
 
 
 def judged_picture(
@@ -107,7 +109,7 @@ def judged_picture(
     """Features of an image whose longer side is ``span`` patterns long."""
     level = float(shaded(torch.zeros(1, 8, 8)).mean())
     rgb = torch.from_numpy(picture)
-    heights = pictures.picture_height(config, picture)
+    heights = pictures.picture_height(config.style, picture, config.baseline is None)
 
     def cut(grey: Float[Tensor, "height width"]) -> Float[Tensor, "n size size"]:
         places = step_generator(0, 0, stream=12)

@@ -21,8 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from styleexp.config.schema import Config, FieldConfig, StyleConfig
-from styleexp.encoders import load_encoder
+from styleexp.config.schema import Config
 from styleexp.experiments.metrics.style import (
     LAYERS,
     Looks,
@@ -37,12 +36,15 @@ from styleexp.experiments.metrics.style import (
 )
 from styleexp.inputs import meshes, shapes
 from styleexp.inputs.images import luminance
-from styleexp.method import targets
+from styleexp.inputs.style import Style
+from styleexp.method import pictures
 from styleexp.method.height_maps import HeightMap, triplanar
 from styleexp.method.losses import gram_matrix, layer_mask
+from styleexp.method.options import FieldConfig, StyleConfig
 from styleexp.method.patches import WINDOW, Relief, relief_of_mesh, relief_of_result, windows
-from styleexp.method.scene import choose_field, pattern_unit
+from styleexp.method.subject import choose_field, pattern_unit
 from styleexp.method.views import orbit
+from styleexp.plugins import load_encoder
 from styleexp.renderers.base import Shading
 from styleexp.renderers.soft_raster import SoftRaster
 
@@ -50,7 +52,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
     from styleexp.encoders import Encoder
-    from styleexp.method.losses import Grams
+    from styleexp.experiments.metrics.style import Grams
 
 SHARPNESS = 6
 """Exponent of the normal's components in the blend of the three projections."""
@@ -186,7 +188,7 @@ def picture_cases(
 
     def laid(unit: float) -> Float[np.ndarray, " vertices"]:
         side = math.sqrt(4 * math.pi) * unit
-        tile = targets.resized(height, min(side / edge, max(height.shape)))
+        tile = pictures.resized(height, min(side / edge, max(height.shape)))
         tile = (tile - tile.mean()) / tile.std().clamp(min=1e-6)
         found = triplanar(HeightMap(tile, side), points, up, SHARPNESS)
         return PICTURE_RELIEF * unit * found.double().numpy()
@@ -230,7 +232,9 @@ def measure_board(
 
     board = Board()
     meshes_of = {name: shapes.make(name) for name in shapes.RELIEFS}
-    frequencies = {name: choose_field(FieldConfig(), style)[0] for name, style in meshes_of.items()}
+    frequencies = {
+        name: choose_field(FieldConfig(), Style.of(mesh))[0] for name, mesh in meshes_of.items()
+    }
     for name, style in meshes_of.items():
         vertices = meshes.normalisation(style.vertices).apply(style.vertices)
         board.styles[name] = sample(relief_of_mesh(style), 1.0, vertices, style.faces)
@@ -244,7 +248,7 @@ def measure_board(
         still = Relief(source.vertices, source.faces, np.zeros(len(normals)))
         board.own[given.name] = sample(still, 1.0, source.vertices, source.faces)
         for style_number, (name, style) in enumerate(meshes_of.items()):
-            unit = pattern_unit(StyleConfig(), source, style)
+            unit = pattern_unit(StyleConfig(), source, Style.of(style))
             seed = 100 * number + style_number
             for what, moved in cases(source, name, unit, frequencies[name], seed):
                 vertices = source.vertices + moved[:, None] * normals
@@ -272,10 +276,10 @@ def measure_pictures(
         frame = meshes.normalisation(given.vertices)
         source = meshes.Mesh(given.name, frame.apply(given.vertices), given.faces)
         normals = meshes.vertex_normals(source.vertices, source.faces)
-        unit = pattern_unit(StyleConfig(), source, None)
         board.own[given.name] = board.plain
         for picture_number, (name, picture) in enumerate(pictures.items()):
             seed = 100 * number + picture_number
+            unit = pattern_unit(StyleConfig(), source, Style.of(picture, name))
             for what, moved in picture_cases(source, picture, unit, seed):
                 vertices = source.vertices + moved[:, None] * normals
                 relief = relief_of_result(source, vertices, source.faces, unit)

@@ -16,7 +16,7 @@ from styleexp.runs import folders
 
 if TYPE_CHECKING:
     from styleexp.experiments.reports.shown import Shown
-    from styleexp.method.gram import Result
+    from styleexp.method.base import Result
     from styleexp.runs.folders import Run
 
 NAME = "report.html"

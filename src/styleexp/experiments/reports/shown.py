@@ -16,7 +16,8 @@ from styleexp.system.errors import UserError
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-    from styleexp.method.gram import Result
+    from styleexp.inputs.style import Style
+    from styleexp.method.base import Result
     from styleexp.runs.folders import Run
 
 WITHIN = 99.5
@@ -75,13 +76,13 @@ class Shown:
 
 def of(result: Result) -> Shown:
     """Content of a run that has just ended."""
-    scene = result.scene
+    subject = result.subject
     return Shown(
-        source=Shape(scene.frame.apply(scene.source.vertices), scene.source.faces),
-        style=_style(scene.style),
-        result=Shape(scene.frame.apply(result.vertices), scene.source.faces),
+        source=Shape(subject.frame.apply(subject.source.vertices), subject.source.faces),
+        style=_style(subject.style),
+        result=Shape(subject.frame.apply(result.vertices), result.faces),
         displacement=result.displacement,
-        radius=scene.frame.scale,
+        radius=subject.frame.scale,
     )
 
 
@@ -181,8 +182,9 @@ def _load(run: Run, missing: list[str]) -> tuple[meshes.Mesh | None, Any]:
     return found.get("source"), found.get("style")
 
 
-def _style(style: meshes.Mesh | np.ndarray) -> Shape | np.ndarray:
-    if isinstance(style, meshes.Mesh):
-        frame = meshes.normalisation(style.vertices)
-        return Shape(frame.apply(style.vertices), style.faces)
-    return style
+def _style(style: Style) -> Shape | np.ndarray:
+    if style.mesh is None:
+        assert style.picture is not None
+        return style.picture
+    frame = meshes.normalisation(style.mesh.vertices)
+    return Shape(frame.apply(style.mesh.vertices), style.mesh.faces)

@@ -189,8 +189,12 @@ def _picture(
             part = copy.copy(getattr(config, kind))
             if record.get("assets"):
                 part.path = str(origins.find(record, config, kind, job.folder) or "") or part.path
-            load: Any = sources.load_source if kind == "source" else sources.load_style
-            content: Any = load(part)
+            content: Any = None
+            if kind == "source":
+                content = sources.load_source(part)
+            else:
+                style = sources.load_style(part)
+                content = style.picture if style.mesh is None else style.mesh
         else:
             status = reading.of_job(job)["status"]
             if status != "done":

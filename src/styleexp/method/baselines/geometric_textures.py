@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,11 +20,11 @@ import torch
 from torch import nn
 
 from styleexp.inputs import meshes, shapes
+from styleexp.method.base import Diverged, Method, Result, Scene, State
 from styleexp.method.baselines.face_gan import Critic, Generator, Patch, gradient_penalty
 from styleexp.method.baselines.pyramid import Level, pyramid, restrict, upsample
-from styleexp.method.gram import Diverged, Result, State
 from styleexp.method.relief import smoother
-from styleexp.method.scene import Subject, load
+from styleexp.method.subject import Subject
 from styleexp.method.surface import Surface, vertex_areas
 from styleexp.method.views import step_generator
 from styleexp.system.errors import UserError
@@ -35,8 +35,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
-    from styleexp.config.schema import Config
-    from styleexp.method.baselines.specs import GeometricTexturesConfig
+    from styleexp.method.baselines.options import GeometricTexturesConfig
 
     Project = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
@@ -60,20 +59,9 @@ LEAST_VERTICES, MOST_VERTICES = 20, 1_000_000
 """Limits on the vertices of source and style: minimum at the lowest level, maximum at the
 highest."""
 
-LIMITS = {
-    "levels": (1, 6),
-    "base": (50, 50_000),
-    "iterations": (1, 10_000),
-    "critic_steps": (1, 20),
-    "patch": (100, 1_000_000),
-    "width": (4, 512),
-    "depth": (1, 16),
-}
-"""Allowed ranges of the options."""
-
 
 @dataclass(frozen=True, kw_only=True)
-class TextureScene(Subject):
+class TextureScene(Scene):
     """Exemplar and source at every level. The subject's source is the source's finest level."""
 
     exemplar: list[Level]
@@ -99,35 +87,33 @@ class TextureStep:
     seconds: float = field(compare=False)
 
 
-class GeometricTextures:
+@dataclass(frozen=True)
+class GeometricTextures(Method[TextureScene]):
     """The geometric-textures baseline: see the module."""
 
-    def __init__(self, config: GeometricTexturesConfig):
-        self.config = config
-        for key, (low, high) in LIMITS.items():
-            value = getattr(config, key)
-            if not low <= value <= high:
-                raise UserError(
-                    f"baseline.{key}={value} is not allowed: give a value from {low} to {high}."
-                )
-        check_size("style", config.base, config.levels)
+    config: GeometricTexturesConfig
 
-    def prepare(self, config: Config) -> TextureScene:
-        """Load and subdivide exemplar and source."""
-        subject = load(config)
-        if not isinstance(subject.style, meshes.Mesh):
+    def __post_init__(self) -> None:
+        check_size("style", self.config.base, self.config.levels)
+
+    def prepare(self, subject: Subject) -> TextureScene:
+        """Subdivide exemplar and source."""
+        if subject.style.mesh is None:
             raise UserError(
                 "method=geometric_textures learns from a mesh, and the style "
-                f"'{config.style.path or config.style.name}' is a picture: give a mesh as style, "
-                "or choose another method."
+                f"'{subject.style.name}' is a picture: give a mesh as style, or choose another "
+                "method."
             )
-        if config.optim.steps < self.config.levels:
+        steps = subject.settings.optim.steps
+        if steps < self.config.levels:
             raise UserError(
-                f"optim.steps={config.optim.steps} leaves a level untrained: give at least "
+                f"optim.steps={steps} leaves a level untrained: give at least "
                 f"baseline.levels={self.config.levels} steps."
             )
         device = subject.surface.vertices.device
-        exemplar, fields = fit_exemplar(subject.style, self.config.base, self.config.levels, device)
+        exemplar, fields = fit_exemplar(
+            subject.style.mesh, self.config.base, self.config.levels, device
+        )
         # Triangles of the exemplar's size, relative to the pattern.
         area = float(_area(subject.surface.vertices, subject.surface.faces))
         own = float(_area(exemplar[0].base, exemplar[0].faces)) * subject.unit**2
@@ -150,15 +136,18 @@ class GeometricTextures:
             f"the result doesn't have the source's own faces: '{source.name}' was resampled to "
             f"{len(levels[0].base)} vertices and subdivided to {len(finest.base)}"
         )
-        changed = {"source": source, "surface": surface, "areas": vertex_areas(surface)}
-        changed["notes"] = (*repairs, note)
-        return TextureScene(
-            **{**vars(subject), **changed}, exemplar=exemplar, fields=fields, levels=levels
+        subdivided = replace(
+            subject,
+            source=source,
+            surface=surface,
+            areas=vertex_areas(surface),
+            notes=(*repairs, note),
         )
+        return TextureScene(subject=subdivided, exemplar=exemplar, fields=fields, levels=levels)
 
     def start(self, scene: TextureScene) -> State:
         """Untrained networks: a generator and a critic per level."""
-        optim = scene.config.optim
+        optim = scene.subject.settings.optim
         width, depth = self.config.width, self.config.depth
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(optim.seed)
@@ -166,14 +155,14 @@ class GeometricTextures:
         networks = nn.ModuleList(
             nn.ModuleDict({"generator": generator, "critic": critic}) for generator, critic in pairs
         )
-        networks.to(scene.surface.vertices.device)
+        networks.to(scene.subject.surface.vertices.device)
         # One optimiser for all: it skips parameters without a gradient.
         adam = torch.optim.Adam(networks.parameters(), lr=optim.rate, betas=(0.5, 0.999))
         return State(networks, adam)
 
     def optimise(self, scene: TextureScene, state: State) -> Iterator[TextureStep]:
         """Train one level after the other, each for an equal share of the steps."""
-        optim, count = scene.config.optim, len(scene.exemplar)
+        optim, count = scene.subject.settings.optim, len(scene.exemplar)
         while state.step < optim.steps:
             begun = time.perf_counter()
             number = state.step * count // optim.steps
@@ -181,12 +170,12 @@ class GeometricTextures:
             with torch.no_grad():
                 rough = _below(scene, state.field, number, random)
                 recalled = _below(scene, state.field, number, None)
-            told = [
+            measured = [
                 self._iterate(scene, state, number, rough, recalled, random)
                 for _ in range(self.config.iterations)
             ]
             state.step += 1
-            loss, critic, penalty, error = np.mean(told, axis=0).tolist()
+            loss, critic, penalty, error = np.mean(measured, axis=0).tolist()
             if not np.isfinite([loss, critic, penalty, error]).all():
                 part = f"the loss of level {number}"
                 raise Diverged(state.step, part, f"{part} became NaN or infinite")
@@ -238,18 +227,20 @@ class GeometricTextures:
         state.optimizer.step()
 
     @torch.no_grad()
-    def finish(self, scene: TextureScene, state: State) -> Result:
+    def finish(self, scene: TextureScene, state: State | None) -> Result:
         """Apply the generators to the source, level by level."""
-        random = step_generator(scene.config.optim.seed, 0, stream=APPLY)
+        assert state is not None
+        subject = scene.subject
+        random = step_generator(scene.subject.settings.optim.seed, 0, stream=APPLY)
         texture = torch.zeros_like(scene.levels[0].base)
         for number, level in enumerate(scene.levels):
             if number:
                 texture = upsample(level, texture)
             texture = _detailed(scene, state.field, number, level, texture, random)
-        size = scene.unit * scene.config.strength * scene.frame.scale
+        size = subject.unit * subject.settings.strength * subject.frame.scale
         moved = texture.double().cpu().numpy() * size
-        normals = scene.surface.normals.double().cpu().numpy()
-        return Result(scene, (moved * normals).sum(axis=1), scene.source.vertices + moved)
+        normals = subject.surface.normals.double().cpu().numpy()
+        return Result(subject, (moved * normals).sum(axis=1), subject.source.vertices + moved)
 
 
 def check_size(what: str, lowest: int, levels: int) -> None:
@@ -315,7 +306,7 @@ def _noise(like: Tensor, number: int, random: torch.Generator) -> Tensor:
 
 
 def _fixed_noise(scene: TextureScene, like: Tensor) -> Tensor:
-    return _noise(like, 0, step_generator(scene.config.optim.seed, 0, stream=RECALL))
+    return _noise(like, 0, step_generator(scene.subject.settings.optim.seed, 0, stream=RECALL))
 
 
 def fit_exemplar(

@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from styleexp.renderers.base import Cameras, Capabilities, Renderer, RenderOutput, Shading
+from styleexp.renderers.base import (
+    Cameras,
+    Capabilities,
+    Renderer,
+    RenderOutput,
+    Shading,
+    lights_of,
+)
 from styleexp.renderers.soft_raster.contour import (
     Compose,
     CrossingDistance,
@@ -86,20 +93,9 @@ class DeferredRenderer(Renderer):
         shading: Shading,
         resolution: tuple[int, int],
     ) -> RenderOutput:
-        """Render one mesh from every camera; see ``Renderer.render``."""
-        light = torch.as_tensor(shading.light).to(vertices).expand(1, len(cameras), 3)
-        return self.render_lights(vertices, faces, cameras, shading, light, resolution)
-
-    def render_lights(
-        self,
-        vertices: Float[Tensor, "vertices 3"],
-        faces: Int[Tensor, "faces 3"],
-        cameras: Cameras,
-        shading: Shading,
-        lights: Float[Tensor, "lights views 3"],
-        resolution: tuple[int, int],
-    ) -> RenderOutput:
-        """Apply all lights to shared visibility; see ``Renderer.render_lights``."""
+        """Render one mesh from every camera; all lights share the visibility. See
+        ``Renderer.render``."""
+        lights = lights_of(shading, cameras, vertices)
         if shading.normals not in ("flat", "smooth"):
             raise unknown_name("kind of normals", shading.normals, ("flat", "smooth"))
         # Views are independent, so without gradients they can be rendered in batches.

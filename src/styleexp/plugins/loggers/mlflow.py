@@ -26,8 +26,8 @@ from mlflow.exceptions import MlflowException
 from sqlalchemy.exc import SQLAlchemyError
 
 if TYPE_CHECKING:
-    from styleexp.method.gram import Result
-    from styleexp.runs.loggers.specs import MLflowConfig
+    from styleexp.method.base import Result
+    from styleexp.plugins.loggers.options import MLflowConfig
 
 SQLITE = "sqlite:///"
 KEPT = "mlflow.json"

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
     from styleexp.config.schema import Config
-    from styleexp.method.gram import Result, Step
+    from styleexp.method.base import Result, Step
 
 
 class Logger(Protocol):

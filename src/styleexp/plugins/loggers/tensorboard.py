@@ -11,8 +11,8 @@ import numpy as np
 from torch.utils.tensorboard import SummaryWriter
 
 if TYPE_CHECKING:
-    from styleexp.method.gram import Result
-    from styleexp.runs.loggers.specs import TensorBoardConfig
+    from styleexp.method.base import Result
+    from styleexp.plugins.loggers.options import TensorBoardConfig
 
 FOLDER = "tensorboard"
 """Subfolder of the run's folder."""
@@ -47,11 +47,11 @@ class TensorBoard:
         self._writer.add_image("preview", picture, self._step, dataformats="HWC")
         if not self._mesh:
             return
-        source = result.scene.source
+        source = result.subject.source
         faces = source.faces[None].astype(np.int32)
         for name, vertices in (("source", source.vertices), ("result", result.vertices)):
             colors = np.full((1, len(vertices), 3), GREY, dtype=np.uint8)
-            shape = result.scene.frame.apply(vertices)[None].astype(np.float32)
+            shape = result.subject.frame.apply(vertices)[None].astype(np.float32)
             self._writer.add_mesh(name, shape, colors, faces, global_step=self._step)
 
     def close(self, status: str) -> None:

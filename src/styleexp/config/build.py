@@ -1,0 +1,81 @@
+"""From a configuration to objects: the method with its parts, and what it works on.
+
+The only module that turns options into parts; the method itself takes objects.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from styleexp import plugins
+from styleexp.config import sources
+from styleexp.config.checks import check
+from styleexp.method.gram_cache import GramCache, uncached
+from styleexp.method.paper import PaperLoop
+from styleexp.method.scene import Parts
+from styleexp.method.subject import Subject, measure
+from styleexp.system.errors import UserError
+
+if TYPE_CHECKING:
+    from styleexp.config.schema import Config
+    from styleexp.method.base import Method, Scene
+    from styleexp.method.scene import Cache
+
+
+def prepare(config: Config) -> tuple[Method[Any], Scene]:
+    """The method of a run and its prepared scene; raises `UserError` for anything that's wrong with
+    the configuration or the files."""
+    check(config)
+    method = method_of(config)
+    return method, method.prepare(subject_of(config, method.separates_relief))
+
+
+def method_of(config: Config) -> Method[Any]:
+    """The method named in ``config.baseline``, or the learned one with its parts."""
+    if config.baseline is not None:
+        return plugins.build("baseline", config.baseline)
+    device = choose_device(config.device)
+    renderer = plugins.build("renderer", config.renderer)
+    encoder = plugins.build("encoder", config.encoder, device=device, seed=config.optim.seed)
+    return PaperLoop(
+        parts=Parts(renderer, encoder, plugins.build("loss", config.loss, encoder=encoder)),
+        field=partial(plugins.build, "field", config.field),
+        separates_relief=config.field.start == "synthesis",
+        cache=cache_of(config, encoder),
+    )
+
+
+def subject_of(config: Config, separate: bool = False) -> Subject:
+    """Load source and style, and measure them; see `method.subject.measure`."""
+    device = choose_device(config.device)
+    source = sources.load_source(config.source)
+    style = sources.load_style(config.style)
+    as_tone = config.baseline is None
+    return measure(config, source, style, device, separate=separate, as_tone=as_tone)
+
+
+def cache_of(config: Config, encoder: Any) -> Cache:
+    """Cache of the style's statistics. Those that involve plugins, whose code can't be hashed, are
+    never cached."""
+    parts = (("renderer", config.renderer), ("encoder", config.encoder), ("loss", config.loss))
+    own = all(plugins.find(kind, part.name).origin == plugins.OWN for kind, part in parts)
+    if not own or config.loss.name != "gram":
+        return uncached
+    options = (config.views, config.shading, config.encoder, config.loss, config.renderer)
+    return GramCache((*options, config.optim.seed), encoder)
+
+
+def choose_device(name: str) -> torch.device:
+    """The requested device; ``auto`` is CUDA if available."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f"device={name} can't be used ({reason}): use device=cpu.") from error
+    return device

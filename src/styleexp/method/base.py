@@ -1,0 +1,142 @@
+"""The contract of a method: source and style in, the generated mesh out."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+from styleexp.inputs import meshes
+from styleexp.system.errors import UserError
+
+if TYPE_CHECKING:
+    import numpy as np
+    import torch
+    from jaxtyping import Float, Int
+
+    from styleexp.method.subject import Subject
+
+
+class Diverged(UserError):
+    """A step produced values the run cannot continue from."""
+
+    def __init__(self, step: int, part: str, reason: str):
+        self.step, self.part = step, part
+        super().__init__(
+            f"{reason} at step {step}: lower optim.rate, or check the source and the style for "
+            "degenerate geometry."
+        )
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a method has prepared and no step changes. Methods with more to keep derive from it."""
+
+    subject: Subject
+    notes: tuple[str, ...] = ()
+    """Notes for the user, besides the subject's."""
+
+
+@dataclass
+class State:
+    """Everything a step changes; the content of a checkpoint."""
+
+    field: Any
+    """A module such as `fields.FourierMLP`."""
+    optimizer: torch.optim.Optimizer
+    step: int = 0
+
+
+@dataclass(frozen=True)
+class Step:
+    """Measurements of one optimisation step."""
+
+    step: int
+    loss: float
+    loss_global: float
+    loss_local: float
+    rms_displacement: float
+    """RMS displacement, in radii of the normalised source."""
+    blank_views: int
+    """Number of views that don't show the mesh; a masked loss (``loss.masked``) skips them."""
+    seconds: float = field(compare=False)
+
+
+@dataclass(frozen=True)
+class Result:
+    """The generated mesh M."""
+
+    subject: Subject
+    """The run's subject; its source has the result's faces."""
+    displacement: Float[np.ndarray, " vertices"]
+    """Signed displacement along the source's normals, in the source's own units."""
+    vertices: Float[np.ndarray, "vertices 3"]
+    """Positions in the source's own frame."""
+
+    @property
+    def faces(self) -> Int[np.ndarray, "faces 3"]:
+        """Indices of M's vertices, the source's faces."""
+        return self.subject.source.faces
+
+    def trimesh(self) -> Any:
+        """M as a ``trimesh.Trimesh`` with the same vertex and face order; the displacement is the
+        vertex attribute ``displacement``."""
+        import trimesh
+
+        return trimesh.Trimesh(
+            self.vertices,
+            self.faces,
+            process=False,
+            vertex_attributes={"displacement": self.displacement},
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write M as PLY (with the displacement as a vertex attribute), OBJ or GLB."""
+        meshes.save_mesh(self.subject.source, self.vertices, path, self.displacement)
+
+
+def displaced(subject: Subject, displacement: Float[torch.Tensor, " vertices"]) -> Result:
+    """M = C + d n (Eq. 1), in the source's own frame. ``displacement`` is in radii of the
+    normalised source."""
+    d = displacement.double().cpu()
+    offset = (d[:, None] * subject.surface.normals.double().cpu()).numpy()
+    radius = subject.frame.scale
+    return Result(subject, d.numpy() * radius, subject.source.vertices + offset * radius)
+
+
+S = TypeVar("S", bound=Scene)
+
+
+class Method(ABC, Generic[S]):
+    """A stylisation method: `prepare`, then `start`, every step of `optimise`, and `finish`.
+
+    `testing.check_method` checks all of this. A method without steps has `finish` alone.
+    """
+
+    separates_relief: bool = False
+    """Whether `Subject.example` is needed: a style mesh's relief apart from its shape."""
+
+    def prepare(self, subject: Subject) -> S:
+        """Measure and build what no step changes."""
+        return Scene(subject)  # type: ignore[return-value]
+
+    def start(self, scene: S) -> State | None:
+        """State before the first step, whose tensors are checkpointed; None without steps."""
+        return None
+
+    def optimise(self, scene: S, state: State) -> Iterator[Any]:
+        """Run the steps from ``state.step`` up to ``optim.steps``, yielding a dataclass after each.
+
+        Its fields form a line of ``metrics.jsonl``; ``step``, ``loss`` and ``seconds`` are
+        displayed. Draw random numbers from `views.step_generator`, so that resumed runs are
+        reproducible.
+        """
+        return iter(())
+
+    @abstractmethod
+    def finish(self, scene: S, state: State | None) -> Result:
+        """The generated mesh, which equals the source where ``subject.mask`` is 0. If its faces
+        differ from the source's, the result's subject has a source with these faces, in the same
+        frame."""
