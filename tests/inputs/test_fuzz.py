@@ -325,7 +325,7 @@ MEASURE = """
 import resource
 import torch
 from tests.inputs.test_fuzz import pile, views
-from styleexp import testing
+from styleexp.testing import renderers as testing
 from styleexp.renderers.base import Shading
 from styleexp.renderers.soft_raster import SoftRaster
 vertices, faces = {mesh}

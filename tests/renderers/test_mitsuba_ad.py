@@ -12,13 +12,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from styleexp import testing
 from styleexp.method.views import orbit
 from styleexp.renderers import llvm
 from styleexp.renderers.base import RenderOutput, Shading
 from styleexp.renderers.mitsuba_ad import MitsubaAD
 from styleexp.renderers.soft_raster import SoftRaster
 from styleexp.system.errors import UserError
+from styleexp.testing import renderers as testing
 from tests.helpers import warm
 
 for package in ("mitsuba", "drjit"):

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 import styleexp
-from styleexp import testing
 from styleexp.inputs import meshes, shapes
 from styleexp.method.views import orbit, zoom
 from styleexp.renderers import moderngl_deferred
@@ -20,6 +19,7 @@ from styleexp.renderers.base import Cameras, RenderOutput, Shading
 from styleexp.renderers.moderngl_deferred import ModernGLDeferred
 from styleexp.renderers.soft_raster import SoftRaster
 from styleexp.system.errors import UserError
+from styleexp.testing import renderers as testing
 from tests.helpers import warm
 from tests.helpers.needed import available
 
@@ -208,7 +208,7 @@ def test_a_lost_context_is_noticed(renderer):
 import os
 os.environ["PYOPENGL_PLATFORM"] = "egl"
 import torch
-from styleexp import testing
+from styleexp.testing import renderers as testing
 from styleexp.system.errors import UserError
 from styleexp.renderers.base import Shading
 from styleexp.renderers.moderngl_deferred import ModernGLDeferred

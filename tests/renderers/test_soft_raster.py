@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from styleexp import testing
 from styleexp.method.views import look_at
 from styleexp.renderers.base import Shading
 from styleexp.renderers.soft_raster import SoftRaster
@@ -34,6 +33,7 @@ from styleexp.renderers.soft_raster.shading import (
     faces_seen,
 )
 from styleexp.system.errors import UserError
+from styleexp.testing import renderers as testing
 
 
 class HardRaster(SoftRaster):
