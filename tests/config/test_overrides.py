@@ -16,7 +16,7 @@ from styleexp.config import overrides
 from styleexp.config.compose import compose
 from styleexp.system.errors import UserError
 from tests.helpers import warm
-from tests.helpers.corpus import obj
+from tests.helpers.corpus.writers import obj
 
 NAMES = (
     "my file (1).obj", "a=b.obj", "a,b.obj", "李明.obj", "Käse.obj", "part#2.obj",

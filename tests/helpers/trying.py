@@ -13,7 +13,8 @@ from unittest import mock
 
 import numpy as np
 
-from tests.helpers.corpus import REFUSED, REPAIRED, WORKS, Case, pixels
+from tests.helpers.corpus import REFUSED, REPAIRED, WORKS, Case
+from tests.helpers.corpus.writers import pixels
 
 OVERRIDES = (
     "method=robust",

@@ -6,7 +6,8 @@ import pytest
 
 from benchmarks import robustness
 from tests.helpers import warm
-from tests.helpers.corpus import CASES, REFUSED, REPAIRED, obj
+from tests.helpers.corpus import CASES, REFUSED, REPAIRED
+from tests.helpers.corpus.writers import obj
 from tests.helpers.trying import OVERRIDES, check
 
 pytestmark = [pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("valid_glbs")]

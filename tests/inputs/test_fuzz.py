@@ -28,7 +28,7 @@ from styleexp.renderers.base import Shading
 from styleexp.renderers.soft_raster import SoftRaster, contour, deferred
 from styleexp.system.errors import UserError
 from tests.helpers import ROOT
-from tests.helpers.corpus import _whole, obj, picture
+from tests.helpers.corpus.writers import obj, picture, whole_files
 
 hypothesis = pytest.importorskip("hypothesis", reason="hypothesis is not installed")
 from hypothesis import HealthCheck, example, given, settings  # noqa: E402
@@ -97,7 +97,7 @@ def test_random_topology_is_kept_or_refused(tmp_path_factory, soup):
 # -------------------------------------------------------------------------------------- files
 
 WHOLE = {kind: content if isinstance(content, bytes) else content()
-         for kind, content in _whole().items()}  # fmt: skip
+         for kind, content in whole_files().items()}  # fmt: skip
 PICTURES = {kind: picture(kind)() for kind in ("PNG", "JPEG", "WEBP", "TIFF", "GIF", "BMP")}
 
 edits = st.lists(

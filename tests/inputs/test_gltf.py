@@ -16,7 +16,7 @@ from styleexp.inputs import meshes
 from styleexp.inputs.meshes import accessors, gltf
 from styleexp.system.errors import UserError
 from tests.helpers import gltf_readers
-from tests.helpers.corpus import CUBE, F, V, glb, gltf_parts, picture
+from tests.helpers.corpus.writers import CUBE, F, V, glb, gltf_parts, picture
 from tests.helpers.needed import available
 
 pytestmark = pytest.mark.usefixtures("valid_glbs")

@@ -13,8 +13,8 @@ from PIL import Image
 
 from styleexp.inputs import meshes
 from styleexp.system.errors import UserError
-from tests.helpers.corpus import F, V
-from tests.helpers.corpus import ply as plain_ply
+from tests.helpers.corpus.writers import F, V
+from tests.helpers.corpus.writers import ply as plain_ply
 
 pytestmark = pytest.mark.usefixtures("valid_glbs")
 

@@ -11,7 +11,7 @@ from styleexp.config.sources import load_source
 from styleexp.inputs import meshes
 from styleexp.inputs.meshes import precision
 from styleexp.system.errors import UserError
-from tests.helpers.corpus import obj, ply, stl
+from tests.helpers.corpus.writers import obj, ply, stl
 
 
 def torus(columns=40, rows=20, radius=10.0, tube=4.0):

@@ -67,7 +67,7 @@ PLUGIN = """
 
     def build(options):
         from styleexp.method.scene import load
-        from styleexp.stylize import Result
+        from styleexp.method.gram import Result
 
         class Inflate:
             def prepare(self, config):

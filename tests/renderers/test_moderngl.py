@@ -203,7 +203,9 @@ def test_a_forked_process_is_told(renderer):
 
 def test_a_lost_context_is_noticed(renderer):
     """pyrender ends EGL for the whole process: that must not go by unseen."""
-    available(lambda: __import__("styleexp.runs.previews").previews.check_available("egl"))
+    from styleexp.runs import previews
+
+    available(lambda: previews.check_available("egl"))
     code = """
 import os
 os.environ["PYOPENGL_PLATFORM"] = "egl"
