@@ -9,9 +9,9 @@ import pytest
 import trimesh
 from PIL import Image
 
-from styleexp import plugins
 from styleexp.config import compose
 from styleexp.experiments import execute as command
+from styleexp.plugins import discovery
 from styleexp.runs import records
 from styleexp.runs.identity import essence, job_key
 from styleexp.runs.loggers import Loggers
@@ -149,8 +149,8 @@ def test_results_have_the_same_bits_whoever_listens(run, broken):
 
 @pytest.mark.parametrize("name", ["tensorboard", "mlflow"])
 def test_a_missing_package_is_said_before_the_run(name, tmp_path, monkeypatch):
-    installed = plugins._importable
-    monkeypatch.setattr(plugins, "_importable", lambda each: each != name and installed(each))
+    installed = discovery._importable
+    monkeypatch.setattr(discovery, "_importable", lambda each: each != name and installed(each))
     with pytest.raises(UserError, match=rf"needs {name}: pip install 'styleexp\[{name}\]'"):
         stylise(tmp_path / "run", f"logger={name}")
     assert not (tmp_path / "run" / "metrics.jsonl").exists()
