@@ -31,8 +31,9 @@ STRESS_FUZZ ?= 50
 STRESS_SECONDS ?= 3600
 
 # Tests of functions, in the tests' own process.
-QUICK := collect fields gltf height_maps losses ply_obj refining relief remembered shapes views \
-	welding
+QUICK := experiments/collect method/fields inputs/gltf method/height_maps method/losses \
+	inputs/ply_obj inputs/refining method/relief method/remembered inputs/shapes method/views \
+	inputs/welding
 
 # On busy cores, spinning OpenMP threads make everything many times slower.
 export OMP_WAIT_POLICY ?= PASSIVE
@@ -50,7 +51,7 @@ test: $(VENV)/.installed-dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
 
 test-quick: $(VENV)/.installed-dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal $(QUICK:%=tests/test_%.py)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal $(foreach each,$(QUICK),tests/$(dir $(each))test_$(notdir $(each)).py)
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
@@ -68,20 +69,20 @@ conformance: $(VENV)/.installed-dev
 stress: stress-sweeps stress-folders stress-fuzz stress-faults stress-long
 
 stress-sweeps: $(VENV)/.installed-dev
-	STYLEEXP_KILLS=10 OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/test_sweeps.py -k kill_9
+	STYLEEXP_KILLS=10 OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/experiments/test_sweeps.py -k kill_9
 
 stress-folders: $(VENV)/.installed-dev
-	STYLEEXP_PAIRS=20 OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/test_folders.py -k two_sweeps
+	STYLEEXP_PAIRS=20 OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/runs/test_folders.py -k two_sweeps
 
 stress-faults: $(VENV)/.installed-dev
-	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/faults.py --seconds $(STRESS_SECONDS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.faults --seconds $(STRESS_SECONDS)
 
 stress-long: $(VENV)/.installed-dev
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/long_haul.py --seconds $(STRESS_SECONDS)
 
 stress-fuzz: $(VENV)/.installed-dev
 	STYLEEXP_FUZZ=$(STRESS_FUZZ) OMP_NUM_THREADS=1 timeout $(STRESS_SECONDS) \
-		$(BIN)/python -m pytest tests/test_fuzz.py
+		$(BIN)/python -m pytest tests/inputs/test_fuzz.py
 
 sbom: $(VENV)-security/.installed $(VENV)/.installed-dev
 	mkdir -p build
@@ -117,7 +118,7 @@ ray-test: pyproject.toml constraints.txt
 	grep -v -i '^cloudpickle==' constraints.txt > $(VENV)-ray/constraints.txt
 	$(VENV)-ray/bin/python -m pip install --quiet --disable-pip-version-check \
 		--constraint $(VENV)-ray/constraints.txt $(PIP_FLAGS) --editable '.[ray]' pytest
-	OMP_NUM_THREADS=1 $(VENV)-ray/bin/python -m pytest tests/test_ray.py
+	OMP_NUM_THREADS=1 $(VENV)-ray/bin/python -m pytest tests/experiments/test_ray.py
 
 clean:
 	rm -rf $(VENV) $(VENV)-ray $(VENV)-security $(VENV)-nox .nox build dist src/*.egg-info

@@ -23,8 +23,10 @@ ROOT = Path(__file__).parent
 PYTHONS = ["3.11", "3.12", "3.13", "3.14"]
 CONSTRAINTS = os.environ.get("CONSTRAINTS", str(ROOT / "constraints.txt"))
 TORCH = os.environ.get("TORCH", "")
-QUICK = ("tests/test_fields.py", "tests/test_losses.py", "tests/test_shapes.py",
-         "tests/test_stylize.py", "tests/test_old_runs.py")  # fmt: skip
+QUICK = (
+    "tests/method/test_fields.py", "tests/method/test_losses.py", "tests/inputs/test_shapes.py",
+    "tests/method/test_stylize.py", "tests/runs/test_old_runs.py",
+)  # fmt: skip
 """Tests that need nothing but the core, and take a minute."""
 
 nox.options.default_venv_backend = "uv|virtualenv"
@@ -37,7 +39,7 @@ def check(session: nox.Session) -> None:
     small = ["source=torus", "style=rail", "method=robust", "profile=smoke", "encoder=vgg19_random"]
     session.install("pytest", "jaxtyping")
     with session.chdir(away):
-        session.run("python", str(ROOT / "tests" / "installed.py"))
+        session.run("python", str(ROOT / "tests" / "helpers" / "installed.py"))
         session.run("styleexp", *small, "metrics.judge=none", "hydra.run.dir=run")
         session.run("styleexp-report", "run")
         session.run("styleexp-metrics", "run", "run", "--judge", "none")

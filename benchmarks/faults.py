@@ -1,10 +1,10 @@
 """Inject faults into runs, sweeps, caches and downloads, and write their table in
 docs/robustness.md.
 
-    python benchmarks/faults.py                     # all, half an hour on one idle core
-    python benchmarks/faults.py --only damaged      # those with this word in their name
-    python benchmarks/faults.py --times 2 --seed 7  # fewer trials, other moments
-    python benchmarks/faults.py --seconds 600       # begin no trial after so long
+    python -m benchmarks.faults                     # all, half an hour on one idle core
+    python -m benchmarks.faults --only damaged      # those with this word in their name
+    python -m benchmarks.faults --times 2 --seed 7  # fewer trials, other moments
+    python -m benchmarks.faults --seconds 600       # begin no trial after so long
 
 Exits with code 1 if a fault lost data. Only rows of tested faults are replaced in the table. Full
 disks and frozen folders are real and need root; clock jumps need Debian's package faketime;
@@ -23,8 +23,7 @@ import time
 import traceback
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "tests"))
+from tests.helpers import ROOT
 
 PAGE = ROOT / "docs" / "robustness.md"
 BEGIN, END = "<!-- begin: benchmarks/faults.py -->\n", "<!-- end: benchmarks/faults.py -->\n"
@@ -33,7 +32,7 @@ HEAD = "| fault | tried | survived | lost | what the user sees |\n" + "| --- " *
 
 def main() -> int:
     """Inject the faults and write the table."""
-    from fault_trials import FAULTS, Missing, Stage
+    from tests.helpers.fault_trials import FAULTS, Missing, Stage
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", default="", help="faults with this in their name")
@@ -78,7 +77,7 @@ def main() -> int:
 
 def page(text: str, rows: dict[str, str]) -> str:
     """The page with these rows updated."""
-    from fault_trials import FAULTS
+    from tests.helpers.fault_trials import FAULTS
 
     start, end = text.index(BEGIN) + len(BEGIN), text.index(END)
     old = {line.split(" | ")[0].removeprefix("| "): line for line in text[start:end].splitlines()}

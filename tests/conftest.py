@@ -5,24 +5,15 @@ from pathlib import Path
 
 import pytest
 
+from tests.helpers import ROOT
+from tests.helpers.needed import available
+
 # Read when torch loads, here and in the processes that tests start.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-BESIDE = Path(__file__).parent.parent.parent / "shared"
+BESIDE = ROOT.parent / "shared"
 if "STYLEEXP_ASSETS" not in os.environ and BESIDE.is_dir():
     os.environ["STYLEEXP_ASSETS"] = str(BESIDE)
-
-
-def available(make):
-    """What ``make`` returns. What it lacks, a `UserError`, is a skip, and in CI a failure."""
-    from styleexp.system.errors import UserError
-
-    try:
-        return make()
-    except UserError as missing:
-        if os.environ.get("CI", "") not in ("", "0", "false"):
-            pytest.fail(str(missing))
-        pytest.skip(str(missing))
 
 
 @pytest.fixture(scope="session")
@@ -46,7 +37,7 @@ def coarse_shapes(monkeypatch):
     from styleexp.inputs import shapes
 
     monkeypatch.setattr(shapes, "make", shapes.make)  # to be put back
-    from coarse import sitecustomize
+    from tests.helpers.coarse import sitecustomize
 
     sitecustomize.coarsen(shapes)
 
@@ -60,9 +51,8 @@ def valid_glbs(tmp_path_factory):
     import shutil
     from unittest import mock
 
-    import gltf_readers
-
     from styleexp.inputs.meshes import reading, writing
+    from tests.helpers import gltf_readers
 
     folder = tmp_path_factory.mktemp("glbs")
     pairs: dict[Path, Path | None] = {}

@@ -4,11 +4,10 @@ import os
 import subprocess
 import sys
 import zipfile
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+from tests.helpers import ROOT
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +31,7 @@ def test_wheel_holds_every_configuration_and_module(wheel):
     files |= {
         str(path.relative_to(ROOT / "src"))
         for folder in ("assets", "vendor")
-        for path in (ROOT / "src/styleexp/reports" / folder).iterdir()
+        for path in (ROOT / "src/styleexp/experiments/reports" / folder).iterdir()
     }
     assert not files - held
     assert "styleexp/py.typed" in held

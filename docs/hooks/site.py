@@ -85,7 +85,7 @@ def repository_link(text, target, anchor, page):
         raise PluginError(f"docs/{page} links to {target}, which isn't there")
     if PACKAGE in path.parents:
         name = ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__")
-        if name == "config":
+        if name == "config.schema":
             return f"[{text}](reference/configuration.md)"
         if any(name in modules for modules in API.values()):
             return f"[{text}]({api_page(name)})"
@@ -93,7 +93,7 @@ def repository_link(text, target, anchor, page):
     return text if path.name in text.strip("`") or told in text else f"{text} (`{told}`)"
 
 
-def on_post_page(output, page, schema):
+def on_post_page(output, page, config):
     """Refuse a page that would ask another machine for something. The search's helper for file://,
     which the theme would load from elsewhere, is here."""
     output = output.replace(SHIM, relative(page.url) + "assets/iframe-worker.js")
@@ -175,7 +175,7 @@ def configuration():
     return "\n\n".join(out) + "\n"
 
 
-def _section(module, name, prefix):
+def _section(module, name, prefix, schema):
     written = module[name]
     rows, nested = [], []
     for field in dataclasses.fields(getattr(schema, name)):

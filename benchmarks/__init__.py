@@ -1,0 +1,1 @@
+"""Measurements and long trials, each run from the checkout: ``python -m benchmarks.NAME``."""
