@@ -7,11 +7,10 @@ import pytest
 from PIL import Image
 
 import styleexp
-from styleexp.config import unread
+from styleexp.config import build, unread
 from styleexp.config.compose import compose
 from styleexp.inputs import meshes, shapes
-from styleexp.method import baselines, scene
-from styleexp.method.baselines.specs import BASELINES
+from styleexp.plugins.catalogue import BASELINES
 from tests.helpers import warm
 
 LEARNS = "which neither renders nor learns: add method=robust to learn."
@@ -57,8 +56,7 @@ def small(tmp_path_factory):
 
 
 def result(config):
-    method = baselines.method(config)
-    prepared = method.prepare(config)
+    method, prepared = build.prepare(config)
     state = method.start(prepared)
     for _ in method.optimise(prepared, state):
         pass
@@ -67,7 +65,7 @@ def result(config):
 
 @pytest.mark.parametrize("name", BASELINES)
 def test_what_a_method_declares_is_what_it_reads(name, small, monkeypatch):
-    monkeypatch.setattr(scene, "check", lambda config: None)  # which reads all
+    monkeypatch.setattr(build, "check", lambda config: None)  # which reads all
     config = compose([*small, f"method={name}", *OPTIONS[name]])
     seen = set()
     for part in ("renderer", "encoder", "field", "views", "shading", "loss", "optim"):

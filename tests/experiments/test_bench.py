@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from styleexp.cli.bench import main
-from styleexp.encoders import load_encoder
 from styleexp.experiments.bench import convergence, render, step
 from styleexp.experiments.bench.floor import convolutions, operations
 from styleexp.experiments.bench.measuring import interleaved
 from styleexp.experiments.bench.parts import Parts
 from styleexp.inputs import meshes, shapes
+from styleexp.plugins import load_encoder
 from styleexp.system.errors import UserError
 from tests.helpers.needed import available
 
@@ -143,12 +143,11 @@ def test_a_steps_parts_sum_to_the_step(learned):
 
 
 def test_the_parts_do_not_change_the_result(learned):
+    from styleexp.config import build
     from styleexp.config.compose import compose
-    from styleexp.method import baselines
 
     config = compose([*learned, "optim.steps=3"])
-    method = baselines.method(config)
-    scene = method.prepare(config)
+    method, scene = build.prepare(config)
     losses = [each.loss for each in method.optimise(scene, method.start(scene))]
     seen = []
     step.measure([*learned, "optim.steps=3"], 1, seen.append)

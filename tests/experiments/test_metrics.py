@@ -16,7 +16,7 @@ from styleexp.experiments.metrics import shape, style, truth
 from styleexp.experiments.metrics.board import nearest
 from styleexp.inputs import meshes, shapes
 from styleexp.method import patches
-from styleexp.method.scene import pattern_unit
+from styleexp.method.subject import pattern_unit
 
 DETAIL = 6_000
 

@@ -44,7 +44,7 @@ def one_encoder(precision: str = "auto") -> Iterator[None]:
     def build(kind: str, options: Any, **given: Any) -> Any:
         return _encoder(precision) if kind == "encoder" else real(kind, options, **given)
 
-    with mock.patch("styleexp.method.scene.build", build):
+    with mock.patch("styleexp.plugins.build", build):
         yield
 
 
@@ -70,8 +70,7 @@ def outcome(case: Case, folder: Path, shared: Path) -> tuple[str, str, Any]:
 
     ``folder`` is empty; ``shared`` keeps what all share. Only `UserError` counts as a refusal.
     """
-    from styleexp.method.gram import finish, optimise, start
-    from styleexp.method.scene import prepare
+    from styleexp.config.build import prepare
     from styleexp.system.errors import UserError
 
     config = copy.deepcopy(_config(shared))
@@ -79,19 +78,21 @@ def outcome(case: Case, folder: Path, shared: Path) -> tuple[str, str, Any]:
     with warnings.catch_warnings(record=True) as caught, one_encoder():
         warnings.simplefilter("always")
         try:
-            scene = prepare(config)
-            state = start(scene)
-            list(optimise(scene, state))
-            result = finish(scene, state)
+            method, scene = prepare(config)
+            state = method.start(scene)
+            list(method.optimise(scene, state))
+            result = method.finish(scene, state)
             for suffix in ("ply", "obj", "glb"):
                 result.save(folder / "out" / f"result.{suffix}")
         except UserError as error:
             return REFUSED, str(error), None
     told = [str(w.message) for w in caught if issubclass(w.category, UserWarning)]
-    repairs = [*scene.source.repairs, *getattr(scene.style, "repairs", ())]
-    stated = [*repairs, *(t for t in [*told, *scene.notes] if case.name in t)]
+    subject = scene.subject
+    repairs = [*subject.source.repairs, *subject.style.repairs]
+    notes = [*subject.notes, *scene.notes]
+    stated = [*repairs, *(t for t in [*told, *notes] if case.name in t)]
     for repair in repairs:  # the user is told
-        assert any(repair in note for note in scene.notes), repair
+        assert any(repair in note for note in notes), repair
     return (REPAIRED if stated else WORKS), " | ".join(stated), result
 
 
@@ -108,7 +109,7 @@ def check(case: Case, folder: Path, shared: Path) -> tuple[str, str]:
     if not case.style:
         from styleexp.inputs.meshes import load_mesh
 
-        source = result.scene.source
+        source = result.subject.source
         counts = len(source.faces), len(source.vertices)
         assert case.faces in (None, counts[0])
         assert case.vertices in (None, counts[1])

@@ -116,24 +116,24 @@ def test_too_many_faces_are_refused(monkeypatch):
 
 
 def test_a_run_refines_for_its_style_and_says_so():
-    from styleexp.config import sources
-    from styleexp.method import scene
+    from styleexp.config.build import subject_of
+    from styleexp.method import refinement
 
     sized = ["source=sphere", "style=scales", "style.scale=2"]
-    plain = scene.load(compose([*sized, "source.refine=none"]))
-    fine = scene.load(compose(sized))
+    plain = subject_of(compose([*sized, "source.refine=none"]))
+    fine = subject_of(compose(sized))
     assert len(fine.source.faces) > len(plain.source.faces)
     longest = as_trimesh(fine.source).edges_unique_length.max() / fine.frame.scale
-    assert longest <= 1 / fine.sigma / sources.PER_WAVE * (1 + 1e-9)
+    assert longest <= 1 / fine.sigma / refinement.PER_WAVE * (1 + 1e-9)
     assert any("refined from" in note for note in fine.notes)
     assert not any("is too coarse" in note for note in fine.notes)
 
 
 def test_a_run_refines_to_a_number_of_faces():
-    from styleexp.method import scene
+    from styleexp.config.build import prepare, subject_of
 
     wanted = 60_000
-    fine = scene.load(compose(["source=sphere", "style=scales", f"source.refine={wanted}"]))
+    fine = subject_of(compose(["source=sphere", "style=scales", f"source.refine={wanted}"]))
     assert 0.7 * wanted < len(fine.source.faces) < 1.4 * wanted
     with pytest.raises(UserError, match=r"source\.refine=many is not allowed: give auto, none or"):
-        scene.load(compose(["source=sphere", "style=scales", "source.refine=many"]))
+        prepare(compose(["source=sphere", "style=scales", "source.refine=many"]))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from styleexp.config.checks import check
 from styleexp.config.compose import compose
-from styleexp.config.schema import check
 from styleexp.config.sources import load_source
 from styleexp.inputs import meshes
 from styleexp.inputs.meshes import precision

@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 import textwrap
 
 import numpy as np
@@ -10,14 +9,17 @@ import pytest
 import torch
 
 import styleexp
+from styleexp.config import build
 from styleexp.config.compose import compose
 from styleexp.inputs import meshes, shapes
-from styleexp.method import baselines
+from styleexp.inputs.style import Style
+from styleexp.method.base import Scene
 from styleexp.method.baselines.face_gan import Critic, Generator, Patch, gradient_penalty
 from styleexp.method.baselines.geometric_textures import choose_patch, fit_exemplar
+from styleexp.method.baselines.options import DisplacementMapConfig
 from styleexp.method.baselines.pyramid import adjacency, pyramid, restrict, upsample
-from styleexp.method.baselines.specs import DisplacementMapConfig
 from styleexp.method.fields import VertexField
+from styleexp.method.paper import PaperLoop
 from styleexp.method.synthesis.method import Synthesis
 from styleexp.system.errors import UserError
 from tests.helpers import warm
@@ -34,8 +36,7 @@ def command(*arguments, cwd, **variables):
 
 
 def run(*overrides):
-    method = baselines.method(compose([*SMOKE, *overrides]))
-    scene = method.prepare(compose([*SMOKE, *overrides]))
+    method, scene = build.prepare(compose([*SMOKE, *overrides]))
     state = method.start(scene)
     steps = list(method.optimise(scene, state))
     return method.finish(scene, state), steps
@@ -45,8 +46,9 @@ def run(*overrides):
 
 
 def test_synthesis_is_the_default_and_without_a_baseline_the_method_is_the_papers():
-    assert isinstance(baselines.method(compose([])), Synthesis)
-    assert baselines.method(compose(["method=robust"])) is sys.modules["styleexp.api"]
+    assert isinstance(build.method_of(compose([])), Synthesis)
+    smoke = compose([*SMOKE, "method=robust"])
+    assert isinstance(build.method_of(smoke), PaperLoop)
 
 
 def test_a_baseline_from_python(tmp_path):
@@ -66,21 +68,14 @@ PLUGIN = """
         amount: float = 0.1
 
     def build(options):
-        from styleexp.method.scene import load
-        from styleexp.method.gram import Result
+        import torch
+        from styleexp.method.base import Method, displaced
 
-        class Inflate:
-            def prepare(self, config):
-                return load(config)
-            def start(self, scene):
-                return None
-            def optimise(self, scene, state):
-                return iter(())
+        class Inflate(Method):
             def finish(self, scene, state):
-                height = options.amount * scene.frame.scale
-                normals = scene.surface.normals.double().numpy()
-                vertices = scene.source.vertices + height * normals
-                return Result(scene, height + 0 * vertices[:, 0], vertices)
+                subject = scene.subject
+                height = torch.full_like(subject.areas, options.amount)
+                return displaced(subject, height)
 
         return Inflate()
 
@@ -119,8 +114,7 @@ def test_a_baseline_of_a_plugin_runs_and_resumes(tmp_path):
 
 
 def test_vertex_field_starts_at_zero_is_bounded_and_free():
-    field = VertexField(0.1)
-    points = field.encode(torch.rand(5, 3))
+    field, points = VertexField(5, 0.1), torch.rand(5, 3)
     assert (field(points) == 0).all()
     (latent,) = field.parameters()
     assert latent.shape == (5,)
@@ -169,17 +163,17 @@ def test_displacement_map_is_as_large_as_style_scale_says_and_as_high_as_the_rel
         "method=displacement_map", "source=sphere", "style=stripe", f"style.scale={scale}"
     )
     assert steps == []
-    vertices = result.scene.source.vertices
+    vertices = result.subject.source.vertices
     around = (np.abs(vertices[:, 1]) < 0.4) & (np.abs(vertices[:, 0]) > 0.8)
     order = np.argsort(vertices[around, 1])
     heights, y = result.displacement[around][order], vertices[around, 1][order]
     smooth = np.interp(np.linspace(-0.4, 0.4, 400), y, heights)
     crossings = (np.diff(np.sign(smooth - smooth.mean())) != 0).sum()
     assert crossings == pytest.approx(2 * 0.8 / (scale * math.pi / 14), abs=2.5)
-    weighted = (result.displacement * result.scene.areas.numpy()).sum()
+    weighted = (result.displacement * result.subject.areas.numpy()).sum()
     assert weighted == pytest.approx(0, abs=1e-4)
     half = np.subtract(*np.percentile(result.displacement, [99, 1])) / 2
-    assert half == pytest.approx(result.scene.relief, rel=0.15)
+    assert half == pytest.approx(result.subject.relief, rel=0.15)
 
 
 def test_displacement_map_of_a_picture_raises_what_is_bright():
@@ -190,17 +184,17 @@ def test_displacement_map_of_a_picture_raises_what_is_bright():
     from styleexp.method.pictures import picture_height
 
     config = compose(["source=sphere", "style=bubble", "method=displacement_map"])
-    method = baselines.method(config)
-    heights = picture_height(config, ramp)
-    scene = replace(method.prepare(config), style=ramp, heights=heights)
-    result = method.finish(scene, None)
-    half = scene.unit * math.sqrt(4 * math.pi) / 2  # y = 0 is the tile's top, bright, border
+    method, scene = build.prepare(config)
+    heights = picture_height(config.style, ramp)
+    subject = replace(scene.subject, style=Style.of(ramp), heights=heights)
+    result = method.finish(Scene(subject), None)
+    half = subject.unit * math.sqrt(4 * math.pi) / 2  # y = 0 is the tile's top, bright, border
     assert half > 1
     assert np.ptp(result.displacement) < 1e-6  # all of the sphere is under the bright half
-    small = replace(scene, unit=0.25)
-    result = method.finish(small, None)
-    front = np.abs(result.scene.source.vertices[:, 0]) > 0.9
-    y = result.scene.source.vertices[front, 1]
+    small = replace(subject, unit=0.25)
+    result = method.finish(Scene(small), None)
+    front = np.abs(result.subject.source.vertices[:, 0]) > 0.9
+    y = result.subject.source.vertices[front, 1]
     tile = 0.25 * math.sqrt(4 * math.pi)
     bright = np.abs(y) < 0.4 * tile
     assert result.displacement[front][bright].min() > 0
@@ -210,7 +204,7 @@ def test_displacement_map_of_a_picture_raises_what_is_bright():
 def test_displacement_map_refuses_what_has_no_meaning(key):
     name, value = key.split("=")
     with pytest.raises(UserError, match=rf"baseline\.{name}"):
-        baselines.method(compose(["method=displacement_map", f"baseline.{key}"]))
+        build.prepare(compose(["method=displacement_map", f"baseline.{key}"]))
     assert float(value) != getattr(DisplacementMapConfig(), name)
 
 

@@ -3,10 +3,10 @@ import math
 import pytest
 import torch
 
-from styleexp.config.schema import FieldConfig
 from styleexp.experiments.metrics.shape import flipped_faces
 from styleexp.inputs import meshes, shapes
-from styleexp.method.fields import DisplacementField, FourierFeatures, zero_mean
+from styleexp.method.fields import FourierFeatures, FourierMLP, zero_mean
+from styleexp.method.options import FieldConfig
 from styleexp.method.surface import Surface, unfolded
 
 
@@ -53,10 +53,11 @@ def test_encoding_follows_points_and_frequencies_that_change_in_place():
 
 @pytest.mark.parametrize("rows", [2, 300])
 def test_bf16_layers_are_those_of_torch(rows):
-    field = DisplacementField(FieldConfig(width=64, depth=4), generator(), 5.0, 0.1)
+    field = FourierMLP(FieldConfig(width=64, depth=4), generator(), 5.0, 0.1)
     torch.nn.init.normal_(field.last.weight, generator=generator())
-    encoded = field.encode(torch.rand(rows, 3, generator=generator()))
-    field(encoded, torch.bfloat16).sum().backward()
+    points = torch.rand(rows, 3, generator=generator())
+    encoded = field.encode(points)
+    field(points, precision=torch.bfloat16).sum().backward()
     fused = [layer.weight.grad.clone() for layer in field.hidden]
     field.zero_grad()
     x = encoded.bfloat16()
@@ -66,54 +67,54 @@ def test_bf16_layers_are_those_of_torch(rows):
         )
     latent = field.last(x.float()).squeeze(-1)
     expected = field.bound * torch.tanh(latent - latent.mean() if field.centred else latent)
-    torch.testing.assert_close(field(encoded, torch.bfloat16), expected)
+    torch.testing.assert_close(field(points, precision=torch.bfloat16), expected)
     expected.sum().backward()
     for gradient, layer in zip(fused, field.hidden, strict=True):
         torch.testing.assert_close(gradient, layer.weight.grad, rtol=0.02, atol=1e-4)
 
 
 def test_starts_at_the_source_and_keeps_its_bound():
-    field = DisplacementField(FieldConfig(), generator(), 5.0, 0.1)
-    encoded = field.encode(torch.rand(50, 3))
-    assert (field(encoded) == 0).all()
+    field = FourierMLP(FieldConfig(), generator(), 5.0, 0.1)
+    points = torch.rand(50, 3)
+    assert (field(points) == 0).all()
     torch.nn.init.normal_(field.last.weight, std=1e3, generator=generator(1))
-    assert field(encoded).max().item() == pytest.approx(0.1)
+    assert field(points).max().item() == pytest.approx(0.1)
 
 
 def test_a_last_layer_at_random_starts_beside_the_source():
-    field = DisplacementField(FieldConfig(last_layer="random"), generator(), 5.0, 0.1)
-    displacement = field(field.encode(torch.rand(50, 3, generator=generator(1))))
+    field = FourierMLP(FieldConfig(last_layer="random"), generator(), 5.0, 0.1)
+    displacement = field(torch.rand(50, 3, generator=generator(1)))
     assert displacement.std() > 0
     assert displacement.abs().max() < 0.1
 
 
 def test_a_clamp_keeps_the_bound_without_bending_what_is_within():
-    field = DisplacementField(FieldConfig(limit="clamp", zero_mean=False), generator(), 5.0, 0.1)
-    encoded = field.encode(torch.rand(5, 3, generator=generator(1)))
+    field = FourierMLP(FieldConfig(limit="clamp", zero_mean=False), generator(), 5.0, 0.1)
+    points = torch.rand(5, 3, generator=generator(1))
     for latent, displacement in ((0.5, 0.05), (-0.9, -0.09), (3.0, 0.1), (-3.0, -0.1)):
         torch.nn.init.constant_(field.last.bias, latent)
-        torch.testing.assert_close(field(encoded), torch.full((5,), displacement))
+        torch.testing.assert_close(field(points), torch.full((5,), displacement))
 
 
 @pytest.mark.parametrize("zero_mean", [True, False])
 def test_a_drift_of_the_mean_saturates_nothing_where_the_mean_is_taken_off(zero_mean):
-    field = DisplacementField(FieldConfig(zero_mean=zero_mean), generator(), 5.0, 0.1)
+    field = FourierMLP(FieldConfig(zero_mean=zero_mean), generator(), 5.0, 0.1)
     torch.nn.init.normal_(field.last.weight, std=0.1, generator=generator(1))
     torch.nn.init.constant_(field.last.bias, 20.0)
-    displacement = field(field.encode(torch.rand(50, 3, generator=generator(2))))
+    displacement = field(torch.rand(50, 3, generator=generator(2)))
     saturated = (displacement.abs() > 0.0999).float().mean()
     assert saturated < 0.1 if zero_mean else saturated == 1
 
 
 def test_paper_sizes():
-    field = DisplacementField(FieldConfig(), generator(), 5.0, 0.1)
+    field = FourierMLP(FieldConfig(), generator(), 5.0, 0.1)
     shapes = [tuple(layer.weight.shape) for layer in (*field.hidden, field.last)]
     assert shapes == [(256, 256)] * 7 + [(1, 256)]
 
 
 def test_equal_generators_make_equal_fields_and_others_do_not():
     def weights(seed):
-        return DisplacementField(FieldConfig(), generator(seed), 5.0, 0.1).hidden[0].weight
+        return FourierMLP(FieldConfig(), generator(seed), 5.0, 0.1).hidden[0].weight
 
     assert torch.equal(weights(1), weights(1))
     assert not torch.equal(weights(1), weights(2))

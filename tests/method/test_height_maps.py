@@ -7,12 +7,12 @@ import pytest
 import torch
 from PIL import Image
 
+from styleexp.config.build import prepare
 from styleexp.config.compose import compose
 from styleexp.inputs import meshes, shapes
 from styleexp.method import height_maps
-from styleexp.method.gram import displace, start
 from styleexp.method.height_maps import HeightMap, mesh_patch, triplanar
-from styleexp.method.scene import prepare
+from styleexp.method.paper import displace
 from tests.helpers.trying import one_encoder
 
 SMALL = (
@@ -65,25 +65,31 @@ def test_patch_of_a_mesh_file_shows_the_same_relief_as_the_analytic_style():
 
 
 def test_the_field_starts_at_the_height_map_and_learns_within_its_share():
-    scene = prepare(compose([*SMALL, "style=bubble"]))
-    state = start(scene)
-    begun = displace(scene, state).detach()
-    torch.testing.assert_close(begun, height_maps.displacement(scene), atol=1e-6, rtol=0)
-    assert np.subtract(*np.percentile(begun, [99, 1])) / 2 == pytest.approx(scene.relief, rel=0.3)
-    assert float((begun * scene.areas).sum() / scene.areas.sum()) == pytest.approx(0, abs=1e-6)
+    method, scene = prepare(compose([*SMALL, "style=bubble"]))
+    state = method.start(scene)
+    begun = displace(scene, state, torch.float32).detach()
+    torch.testing.assert_close(begun, height_maps.displacement(scene.subject), atol=1e-6, rtol=0)
+    assert np.subtract(*np.percentile(begun, [99, 1])) / 2 == pytest.approx(
+        scene.subject.relief, rel=0.3
+    )
+    assert float((begun * scene.subject.areas).sum() / scene.subject.areas.sum()) == pytest.approx(
+        0, abs=1e-6
+    )
     with torch.no_grad():
         state.field.last.weight.normal_(std=100.0)  # tanh saturates: as far as the field can go
-    moved = (displace(scene, state) - begun).abs().max().item()
-    assert scene.bound * 0.2 < moved <= scene.bound * 0.25 * 2  # twice, for the mean's sake
-    assert displace(scene, state).abs().max() <= scene.bound
+    moved = (displace(scene, state, torch.float32) - begun).abs().max().item()
+    assert (
+        scene.subject.bound * 0.2 < moved <= scene.subject.bound * 0.25 * 2
+    )  # twice, for the mean's sake
+    assert displace(scene, state, torch.float32).abs().max() <= scene.subject.bound
 
 
 def test_the_papers_field_starts_at_the_source_and_has_the_whole_bound():
-    scene = prepare(compose([*SMALL, "style=bubble", "field.start=source"]))
+    method, scene = prepare(compose([*SMALL, "style=bubble", "field.start=source"]))
     assert scene.base is None
-    state = start(scene)
-    assert not displace(scene, state).any()
-    assert state.field.bound == scene.bound
+    state = method.start(scene)
+    assert not displace(scene, state, torch.float32).any()
+    assert state.field.bound == scene.subject.bound
     assert compose(["source=torus", "style=bubble", "method=paper"]).field.start == "source"
 
 
@@ -91,9 +97,11 @@ def test_a_picture_is_a_height_map_too(tmp_path):
     rows, columns = np.mgrid[:128, :128]
     waves = np.cos(rows * np.pi / 8) * np.cos(columns * np.pi / 8)
     Image.fromarray((127.5 + 127.5 * waves).astype(np.uint8)).save(tmp_path / "waves.png")
-    scene = prepare(compose([*SMALL, f"style.path={tmp_path}/waves.png"]))
-    torch.testing.assert_close(displace(scene, start(scene)), scene.base, atol=1e-6, rtol=0)
-    assert scene.base.std() > 0.2 * scene.relief
+    method, scene = prepare(compose([*SMALL, f"style.path={tmp_path}/waves.png"]))
+    torch.testing.assert_close(
+        displace(scene, method.start(scene), torch.float32), scene.base, atol=1e-6, rtol=0
+    )
+    assert scene.base.std() > 0.2 * scene.subject.relief
 
 
 def test_a_style_too_coarse_for_a_height_map_is_told_and_starts_at_the_source(tmp_path):
@@ -101,6 +109,6 @@ def test_a_style_too_coarse_for_a_height_map_is_told_and_starts_at_the_source(tm
     faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
     mesh = meshes.Mesh("octahedron", octahedron, np.array(faces))
     meshes.save_mesh(mesh, mesh.vertices, tmp_path / "octahedron.ply")
-    scene = prepare(compose([*SMALL, f"style.path={tmp_path}/octahedron.ply"]))
+    method, scene = prepare(compose([*SMALL, f"style.path={tmp_path}/octahedron.ply"]))
     assert scene.base is None
     assert any("'octahedron' is too coarse for a height map" in note for note in scene.notes)

@@ -4,10 +4,11 @@ import pytest
 import torch
 from torch.nn import functional
 
-from styleexp.config.schema import LossConfig
-from styleexp.encoders import Encoder, load_encoder
-from styleexp.method.losses import UNDIVIDED, StyleLoss, gram_matrix, layer_mask, layer_masks
+from styleexp.encoders import VGG
+from styleexp.method.losses import UNDIVIDED, GramLoss, gram_matrix, layer_mask, layer_masks
+from styleexp.method.options import LossConfig
 from styleexp.method.viewer import Images
+from styleexp.plugins import load_encoder
 
 
 def test_gram_is_the_normalised_product_averaged_over_views():
@@ -71,7 +72,7 @@ def test_masks_are_those_that_pooling_gives(height, width, erosion):
 def grams(loss, image, coverage=None):
     """Grams of images, by default covered everywhere."""
     coverage = torch.ones_like(image[..., 0]) if coverage is None else coverage
-    return loss.grams(Images(image, coverage))
+    return loss.describe(Images(image, coverage))
 
 
 @pytest.fixture(scope="module")
@@ -81,13 +82,13 @@ def encoder():
 
 
 def test_the_papers_layers_by_index_and_by_name_are_the_same(encoder):
-    by_index = StyleLoss(LossConfig(layers=[1, 3, 5, 9, 13]), encoder)
-    by_name = StyleLoss(LossConfig(), encoder)
+    by_index = GramLoss(LossConfig(layers=[1, 3, 5, 9, 13]), encoder)
+    by_name = GramLoss(LossConfig(), encoder)
     assert by_index.layers == by_name.layers
 
 
 def test_an_encoder_that_serves_other_activations_is_asked_for_them(encoder):
-    class Doubled(Encoder):
+    class Doubled(VGG):
         def forward(self, images, layers):
             return {name: 2 * found for name, found in super().forward(images, layers).items()}
 
@@ -96,7 +97,7 @@ def test_an_encoder_that_serves_other_activations_is_asked_for_them(encoder):
     images, disc = torch.rand(2, 64, 64, 1), torch.zeros(2, 64, 64)
     disc[:, 5:60, 9:] = 1
     for config in (LossConfig(masked=False), LossConfig(erosion=0)):
-        ours, theirs = (grams(StyleLoss(config, each), images, disc) for each in (encoder, other))
+        ours, theirs = (grams(GramLoss(config, each), images, disc) for each in (encoder, other))
         for single, doubled in zip(ours, theirs, strict=True):
             assert single.any()
             torch.testing.assert_close(4 * single, doubled, rtol=1e-4, atol=1e-5)
@@ -104,7 +105,7 @@ def test_an_encoder_that_serves_other_activations_is_asked_for_them(encoder):
 
 def test_distance_is_zero_at_the_target_and_weights_blocks(encoder):
     images = torch.rand(2, 64, 64, 1)
-    loss = StyleLoss(LossConfig(relative="none", block_weights=[1, 0, 0, 0, 0]), encoder)
+    loss = GramLoss(LossConfig(relative="none", block_weights=[1, 0, 0, 0, 0]), encoder)
     own, other = grams(loss, images), grams(loss, images.square())
     scales = loss.scales(own, other)
     assert loss.distance(own, own, scales) == 0
@@ -114,7 +115,7 @@ def test_distance_is_zero_at_the_target_and_weights_blocks(encoder):
 
 def test_relative_to_the_source_starts_every_layer_at_one(encoder):
     images = torch.rand(2, 64, 64, 1)
-    loss = StyleLoss(LossConfig(relative="source", block_weights=[1] * 5), encoder)
+    loss = GramLoss(LossConfig(relative="source", block_weights=[1] * 5), encoder)
     target, source = grams(loss, images), grams(loss, 1 - images * 0.5)
     scales = loss.scales(target, source)
     assert loss.distance(source, target, scales) == pytest.approx(5.0, rel=1e-4)
@@ -128,7 +129,7 @@ def test_background_does_not_matter_when_masked(encoder):
     coverage[:, 16:48, 16:48] = 1
     white = images.clone()
     white[coverage == 0] = 1.0
-    loss = StyleLoss(LossConfig(layers=["conv1_1", "conv2_1"], erosion=2), encoder)
+    loss = GramLoss(LossConfig(layers=["conv1_1", "conv2_1"], erosion=2), encoder)
     for a, b in zip(grams(loss, images, coverage), grams(loss, white, coverage), strict=True):
         torch.testing.assert_close(a, b)
 
@@ -137,7 +138,7 @@ def test_a_layer_whose_target_is_empty_does_not_count(encoder):
     images = torch.rand(1, 64, 64, 1)
     dot = torch.zeros(1, 64, 64)
     dot[:, 20:44, 20:44] = 1  # no cell of conv5_1 is wholly inside
-    loss = StyleLoss(LossConfig(block_weights=[0, 0, 0, 0, 1]), encoder)
+    loss = GramLoss(LossConfig(block_weights=[0, 0, 0, 0, 1]), encoder)
     target, source = grams(loss, images, dot), grams(loss, images * 0.5)
     assert target[4].abs().sum() == 0
     assert loss.distance(source, target, loss.scales(target, source)) == 0

@@ -11,12 +11,12 @@ import trimesh
 from PIL import Image
 
 import styleexp
-from styleexp.config import sources
+from styleexp.config import build, sources
 from styleexp.config.compose import compose
 from styleexp.config.overrides import understood
-from styleexp.config.schema import StyleConfig
 from styleexp.inputs import meshes
-from styleexp.method import masks, scene
+from styleexp.method import masks
+from styleexp.method.options import StyleConfig
 from styleexp.method.synthesis.method import directions
 from styleexp.method.synthesis.walk import Sheet
 from styleexp.runs import identity, origins
@@ -117,32 +117,28 @@ def test_a_thin_parts_other_side_is_not_in_the_border():
 def test_beyond_the_mask_no_bit_moves_and_within_it_the_mean_is_zero(options):
     given = painted_ball(right=right)
     result = styleexp.stylize(given, "bubble", *options, "style.mask=attribute:right")
-    source, mask = result.scene.source, result.scene.mask.numpy()
+    source, mask = result.subject.source, result.subject.mask.numpy()
     assert (result.vertices[mask == 0] == source.vertices[mask == 0]).all()
     assert (mask == 0).mean() > 0.4
-    moved = result.displacement * result.scene.areas.numpy()
+    moved = result.displacement * result.subject.areas.numpy()
     assert result.displacement[mask == 1].std() > 0.005
     assert abs(moved.sum()) < 0.02 * np.abs(moved).sum()  # where no face turned over, 0
 
 
 def test_the_learned_field_keeps_within_the_mask():
-    from styleexp.method import gram
+    from types import SimpleNamespace
+
+    from styleexp.method.base import State
+    from styleexp.method.paper import displace
 
     config = compose(["source=sphere", "style=bubble", "style.mask=height:0.5..1"])
-    subject = scene.load(config)
-    full = scene.Scene.__new__(scene.Scene)
-    base = torch.ones(len(subject.areas)) * 0.01
-    vars(full).update(vars(subject), base=base)
+    subject = build.subject_of(config)
+    scene = SimpleNamespace(subject=subject, base=torch.ones(len(subject.areas)) * 0.01)
 
-    class Field(torch.nn.Module):
-        def encode(self, points, opened=1.0):
-            return points
+    def field(points, opened, precision):
+        return 0.01 * torch.sin(9 * points[:, 0])
 
-        def forward(self, points, precision=None):
-            return 0.01 * torch.sin(9 * points[:, 0])
-
-    state = gram.State(Field(), None)
-    moved = gram.displace(full, state, torch.float32)
+    moved = displace(scene, State(field, None), torch.float32)
     assert (moved[subject.mask == 0] == 0).all()
     assert moved.abs().max() > 0.005
     assert abs(float((moved * subject.areas).sum())) < 1e-4
@@ -154,8 +150,8 @@ def test_two_runs_with_the_two_halves_put_two_styles_on_one_mesh(tmp_path):
     first.save(tmp_path / "first.ply")
     rest = (*MAP, "style.mask=not:attribute:right")
     second = styleexp.stylize(tmp_path / "first.ply", "bubble", *rest)
-    mask = first.scene.mask.numpy()
-    assert (second.vertices[mask == 1] == second.scene.source.vertices[mask == 1]).all()
+    mask = first.subject.mask.numpy()
+    assert (second.vertices[mask == 1] == second.subject.source.vertices[mask == 1]).all()
     assert np.abs(second.vertices[mask == 1] - first.vertices[mask == 1]).max() < 1e-6
     alone = styleexp.stylize(tmp_path / "ball.ply", "bubble", *rest)
     there = mask == 0
@@ -239,7 +235,7 @@ def test_a_direction_of_the_file_is_followed_and_turned():
         options = ("method=synthesis", "source.refine=none", "source=sphere", "style=stripe")
         asked = ("style.direction=attribute:way", f"style.rotation={rotation}")
         with sources.given(source=given):
-            subject = scene.load(compose([*options, *asked]))
+            subject = build.subject_of(compose([*options, *asked]))
         surface = subject.surface
         sheet = Sheet(surface.vertices.numpy(), given.faces, surface.normals.numpy())
         ahead.append(directions(subject, sheet, directed=True))

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 
+from styleexp.config.build import prepare
+from styleexp.config.checks import check
 from styleexp.config.compose import compose
-from styleexp.config.schema import check
 from styleexp.experiments import execute as command
-from styleexp.method.gram import Diverged, blank, optimise, start
-from styleexp.method.scene import prepare
+from styleexp.method.base import Diverged
 from styleexp.method.viewer import Images
 from styleexp.system.errors import UserError
 
@@ -29,8 +29,18 @@ pytestmark = pytest.mark.filterwarnings("ignore:the encoder 'vgg19_random'")
 
 
 @pytest.fixture(scope="module")
-def scene():
+def prepared():
     return prepare(compose([*SMOKE, "source=torus", "optim.steps=3"]))
+
+
+@pytest.fixture
+def method(prepared):
+    return prepared[0]
+
+
+@pytest.fixture
+def scene(prepared):
+    return prepared[1]
 
 
 def spoil(scene, part):
@@ -63,29 +73,29 @@ def spoil(scene, part):
     ("part", "named"),
     [("local views", "the local views became"), ("loss", "the loss of the local views became")],
 )
-def test_what_is_not_a_number_is_named_with_its_step(scene, part, named):
+def test_what_is_not_a_number_is_named_with_its_step(method, scene, part, named):
     broken = spoil(scene, part)
-    state = start(broken)
+    state = method.start(broken)
     with pytest.raises(Diverged, match=f"^{named} NaN or infinite at step") as caught:
-        list(optimise(broken, state))
+        list(method.optimise(broken, state))
     assert caught.value.step == state.step
     assert all(p.isfinite().all() for p in state.field.parameters())
 
 
-def test_a_gradient_that_is_not_a_number_never_reaches_the_field(scene):
-    state = start(scene)
+def test_a_gradient_that_is_not_a_number_never_reaches_the_field(method, scene):
+    state = method.start(scene)
     weights = [p.clone() for p in state.field.parameters()]
     state.field.last.weight.register_hook(lambda grad: grad * math.inf)
     with pytest.raises(Diverged, match="the gradient became NaN or infinite at step 0"):
-        list(optimise(scene, state))
+        list(method.optimise(scene, state))
     for before, after in zip(weights, state.field.parameters(), strict=True):
         assert torch.equal(before, after)
 
 
-def test_an_exploding_loss_stops(scene):
+def test_an_exploding_loss_stops(method, scene):
     tiny = [torch.full_like(scale, 1e-12) for scale in scene.scales[1]]
-    state = start(scene)
-    steps = optimise(scene, state)
+    state = method.start(scene)
+    steps = method.optimise(scene, state)
     next(steps)
     for scale, small in zip(scene.scales[1], tiny, strict=True):
         scale.copy_(small)
@@ -99,15 +109,15 @@ def test_an_exploding_loss_stops(scene):
 
 def test_the_command_names_the_last_good_checkpoint(tmp_path, monkeypatch):
     """Through the run itself: its error, its status, and a checkpoint that holds numbers."""
-    from styleexp.method.losses import StyleLoss
+    from styleexp.method.losses import GramLoss
 
-    real, calls = StyleLoss.distance, iter(range(100))
+    real, calls = GramLoss.distance, iter(range(100))
 
     def distance(self, grams, target, scales):
         value = real(self, grams, target, scales)
         return value * math.nan if next(calls) >= 4 else value  # two a step
 
-    monkeypatch.setattr(StyleLoss, "distance", distance)
+    monkeypatch.setattr(GramLoss, "distance", distance)
     config = compose([*SMOKE, "source=torus"])
     with pytest.raises(UserError) as caught:
         command.run(config, tmp_path / "run", [])
@@ -125,19 +135,19 @@ def test_the_command_names_the_last_good_checkpoint(tmp_path, monkeypatch):
 def test_views_that_show_nothing_are_counted():
     coverage = torch.zeros(3, 8, 8)
     coverage[1, 2, 2] = 0.5
-    assert blank(Images(torch.ones(3, 8, 8, 1), coverage)) == 2
+    assert Images(torch.ones(3, 8, 8, 1), coverage).blank() == 2
 
 
-def test_blank_views_are_counted_step_by_step_and_change_nothing(scene):
+def test_blank_views_are_counted_step_by_step_and_change_nothing(method, scene):
     """A view that shows nothing has no cell in the Gram matrices: they are those of the others."""
-    whole, _ = scene.viewer(scene.surface.vertices, 0)
+    whole, _ = scene.viewer(scene.subject.surface.vertices, 0)
     empty = Images(
         torch.cat([whole.image, torch.rand_like(whole.image[:1])]),
         torch.cat([whole.coverage, torch.zeros_like(whole.coverage[:1])]),
     )
-    for alone, among in zip(scene.loss.grams(whole), scene.loss.grams(empty), strict=True):
+    for alone, among in zip(scene.loss.describe(whole), scene.loss.describe(empty), strict=True):
         torch.testing.assert_close(alone, among, rtol=1e-4, atol=1e-7)
-    steps = list(optimise(scene, start(scene)))
+    steps = list(method.optimise(scene, method.start(scene)))
     assert [step.blank_views for step in steps] == [0, 0, 0]
 
 

@@ -9,10 +9,10 @@ import pytest
 from PIL import Image
 
 import styleexp
-from styleexp.config import sources
+from styleexp.config import build, sources
 from styleexp.config.compose import compose
 from styleexp.config.schema import Config, StyleConfig
-from styleexp.method import pictures, scene
+from styleexp.method import pictures
 from styleexp.method.height_maps import picture_side
 from styleexp.system.errors import UserError
 
@@ -88,7 +88,10 @@ def test_the_relief_is_as_deep_on_the_source_as_in_the_picture(kind, tmp_path):
     for scale in (1.0, 0.5):
         tiled = (f"style.image_tile={0.7 * scale}", f"style.kind={kind}")
         result = styleexp.stylize("sphere", tmp_path / "a.png", *MAP, *tiled)
-        side = picture_side(result.scene.config, result.scene.unit) * result.scene.frame.scale
+        side = (
+            picture_side(result.subject.settings.style, result.subject.unit)
+            * result.subject.frame.scale
+        )
         low, high = np.percentile(result.displacement, [0.1, 99.9])
         assert high - low == pytest.approx(0.04 * side, rel=0.2)
 
@@ -109,7 +112,7 @@ def test_synthesis_takes_the_same_heights():
         ]
     )
     with sources.given(style=picture):
-        subject = scene.load(config)
+        subject = build.subject_of(config)
     exemplar = exemplar_of_style(subject)
     depth = np.ptp(exemplar.height.numpy())
     assert depth == pytest.approx(0.4 * 0.05 * 0.5 * math.sqrt(4 * math.pi), rel=0.1)
@@ -136,5 +139,5 @@ def test_a_normal_map_is_told_of_and_only_heights_are_read_of_it():
     for method, told in (("displacement_map", "green up"), ("robust", "read as tone")):
         with sources.given(style=colors):
             config = compose([f"method={method}", "source=sphere", "style=bubble"])
-            subject = scene.load(config)
+            subject = build.subject_of(config)
         assert any(told in note for note in subject.notes), subject.notes

@@ -9,10 +9,9 @@ import pytest
 import torch
 
 import styleexp
+from styleexp.config.build import prepare, subject_of
 from styleexp.config.compose import compose
 from styleexp.inputs import meshes, shapes
-from styleexp.method.gram import finish, optimise, start
-from styleexp.method.scene import load, prepare
 from tests.helpers.trying import one_encoder
 
 NEAR = 0.05
@@ -58,10 +57,11 @@ def save(path, vertices, faces):
 
 
 def run(*overrides):
-    scene = prepare(compose([*FAST, *overrides]))
-    state = start(scene)
-    list(optimise(scene, state))
-    return finish(scene, state)
+    method, scene = prepare(compose([*FAST, *overrides]))
+    state = method.start(scene)
+    if state is not None:
+        list(method.optimise(scene, state))
+    return method.finish(scene, state)
 
 
 def apart(one, other):
@@ -77,7 +77,7 @@ def plain(torus, style, tmp_path_factory):
 
 def test_topology_is_the_sources_and_the_bound_holds(torus, plain, tmp_path):
     for result in plain.values():
-        scene = result.scene
+        scene = result.subject
         np.testing.assert_array_equal(scene.source.faces, torus.faces)
         np.testing.assert_array_equal(scene.source.vertices, torus.vertices)
         reach = scene.bound * scene.frame.scale
@@ -120,7 +120,7 @@ def test_a_rotation_changes_no_measure_of_the_source(torus, style, tmp_path):
     turn, _ = np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))
     turn *= np.sign(np.linalg.det(turn))
     found = [
-        load(compose([*FAST, style, save(tmp_path / f"{k}.obj", vertices, torus.faces)]))
+        subject_of(compose([*FAST, style, save(tmp_path / f"{k}.obj", vertices, torus.faces)]))
         for k, vertices in enumerate((torus.vertices, torus.vertices @ turn.T))
     ]
     one, other = found
@@ -150,18 +150,5 @@ def test_a_pictures_encoding_does_not_matter(torus, tmp_path):
 @pytest.mark.parametrize("method", ["robust", "paper", "vertex", "displacement_map"])
 def test_strength_zero_gives_the_source_back_exactly(torus, style, method, tmp_path):
     source = save(tmp_path / "a.obj", torus.vertices, torus.faces)
-    result = styleexp_run(source, style, f"method={method}", "strength=0", "optim.steps=1")
+    result = run(source, style, f"method={method}", "strength=0", "optim.steps=1")
     assert result.vertices.tobytes() == torus.vertices.tobytes()
-
-
-def styleexp_run(*overrides):
-    """Any method's result, the baselines' included."""
-    from styleexp.method import baselines
-
-    config = compose([*FAST, *overrides])
-    method = baselines.method(config)
-    scene = method.prepare(config)
-    state = method.start(scene)
-    for _ in method.optimise(scene, state):
-        pass
-    return method.finish(scene, state)

@@ -1,10 +1,10 @@
 import pytest
 import torch
 
+from styleexp.config.build import prepare
 from styleexp.config.compose import compose
 from styleexp.inputs import meshes, shapes
 from styleexp.method import gram_cache
-from styleexp.method.scene import prepare
 
 SMOKE = ["encoder=vgg19_random", "method=robust", "profile=smoke"]
 
@@ -26,7 +26,7 @@ def made(monkeypatch, tmp_path):
     def make(*overrides):
         written.clear()
         given = [f"source.path={paths[0]}", f"style.path={paths[1]}", *overrides]
-        return prepare(compose([*SMOKE, *given])), len(written)
+        return prepare(compose([*SMOKE, *given]))[1], len(written)
 
     return make
 
@@ -49,7 +49,7 @@ def test_the_second_run_measures_nothing_and_has_the_same_bits(made):
         "optim.seed=1",
         "views.resolution=60",
         "shading.albedo=0.4",
-        "encoder.pooling=avg",
+        "encoder.activations=conv",
         "loss.erosion=1",
         "renderer.visibility_gradient=none",
         "style.scale=1.2",

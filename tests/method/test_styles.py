@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from styleexp.config.schema import StyleConfig
 from styleexp.method import targets
+from styleexp.method.options import StyleConfig
 
 
 def blobs() -> torch.Tensor:

@@ -9,17 +9,10 @@ import torch
 from PIL import Image
 
 import styleexp
+from styleexp.config.build import choose_device, prepare
 from styleexp.config.compose import compose
-from styleexp.config.schema import OptimConfig
-from styleexp.method.gram import (
-    finish,
-    gradient_length,
-    learning_rate,
-    normalise_gradient,
-    optimise,
-    start,
-)
-from styleexp.method.scene import choose_device, prepare
+from styleexp.method.options import OptimConfig
+from styleexp.method.stepping import gradient_length, learning_rate, normalise_gradient
 from styleexp.system.errors import UserError
 
 SMOKE = ("method=robust", "profile=smoke", "encoder=vgg19_random")
@@ -27,10 +20,10 @@ pytestmark = pytest.mark.filterwarnings("ignore:the encoder 'vgg19_random'")
 
 
 def run(*overrides):
-    scene = prepare(compose([*SMOKE, *overrides]))
-    state = start(scene)
-    steps = list(optimise(scene, state))
-    return finish(scene, state), steps
+    method, scene = prepare(compose([*SMOKE, *overrides]))
+    state = method.start(scene)
+    steps = list(method.optimise(scene, state))
+    return method.finish(scene, state), steps
 
 
 def test_robust_and_paper_run_and_displace_along_the_normals():
@@ -38,16 +31,18 @@ def test_robust_and_paper_run_and_displace_along_the_normals():
         result, steps = run("source=sphere", "style=stripe", f"method={method}")
         assert [s.step for s in steps] == [1, 2, 3, 4]
         assert np.isfinite(result.vertices).all()
-        moved = result.vertices - result.scene.source.vertices
+        moved = result.vertices - result.subject.source.vertices
         assert np.abs(result.displacement).max() > 0
-        normals = result.scene.surface.normals.numpy()
+        normals = result.subject.surface.normals.numpy()
         np.testing.assert_allclose(moved, result.displacement[:, None] * normals, atol=1e-6)
-        assert np.abs(result.displacement).max() <= 0.1 * result.scene.frame.scale
+        assert np.abs(result.displacement).max() <= 0.1 * result.subject.frame.scale
 
 
 def viewed(*overrides):
-    scene = prepare(compose([*SMOKE, "source=sphere", "style=bubble", "method=paper", *overrides]))
-    return scene, scene.viewer(scene.surface.vertices, 0)
+    _, scene = prepare(
+        compose([*SMOKE, "source=sphere", "style=bubble", "method=paper", *overrides])
+    )
+    return scene, scene.viewer(scene.subject.surface.vertices, 0)
 
 
 def test_a_perspective_brings_in_the_background_unless_a_fill_is_given():
@@ -91,7 +86,7 @@ def test_the_foreground_alone_can_be_for_pictures(tmp_path):
         tmp_path / "noise.png"
     )
     mesh, picture = (
-        prepare(compose([*SMOKE, "source=sphere", *style, "method=paper_amended"]))
+        prepare(compose([*SMOKE, "source=sphere", *style, "method=paper_amended"]))[1]
         for style in (["style=bubble"], [f"style.path={tmp_path / 'noise.png'}"])
     )
     assert not mesh.loss.config.masked
@@ -102,9 +97,9 @@ def test_sigma_and_bound_are_in_the_radii_asked_for():
     size = {}
     for unit in ("style", "source"):
         scene, _ = viewed(f"field.unit={unit}", "style.scale_by=area", "source=torus")
-        size[unit] = scene.sigma / 5, scene.bound / 0.1
+        size[unit] = scene.subject.sigma / 5, scene.subject.bound / 0.1
     assert size["source"] == (1, 1)
-    assert size["style"] == pytest.approx((1 / scene.unit, scene.unit))
+    assert size["style"] == pytest.approx((1 / scene.subject.unit, scene.subject.unit))
 
 
 def test_same_seed_gives_the_same_mesh_and_another_seed_another():
@@ -151,7 +146,7 @@ def test_a_normalised_gradient_has_length_one_and_its_own_direction():
 
 def test_strength_zero_gives_the_source_back_exactly():
     result, _ = run("source=torus", "style=bubble", "strength=0")
-    assert np.array_equal(result.vertices, result.scene.source.vertices)
+    assert np.array_equal(result.vertices, result.subject.source.vertices)
 
 
 def test_result_is_in_the_sources_own_frame(tmp_path):
@@ -162,7 +157,7 @@ def test_result_is_in_the_sources_own_frame(tmp_path):
     far = run(f"source.path={tmp_path}/far.ply", "style=wave_large")[0]
     np.testing.assert_allclose(far.displacement, 40 * near.displacement, atol=40 * 2e-3)
     np.testing.assert_allclose(
-        far.vertices - far.displacement[:, None] * far.scene.surface.normals.numpy(),
+        far.vertices - far.displacement[:, None] * far.subject.surface.normals.numpy(),
         mesh.vertices * 40 + 7,
         atol=1e-3,
     )
@@ -209,10 +204,10 @@ def test_python_call_equals_the_command_line(tmp_path):
 
 
 def test_a_loss_that_explodes_is_reported_with_its_step():
-    scene = prepare(compose([*SMOKE, "source=torus", "style=bubble"]))
+    method, scene = prepare(compose([*SMOKE, "source=torus", "style=bubble"]))
     broken = dataclasses.replace(scene, scales=([torch.tensor(0.0)] * 5, [torch.tensor(0.0)] * 5))
     with pytest.raises(UserError, match="at step 0"):
-        list(optimise(broken, start(broken)))
+        list(method.optimise(broken, method.start(broken)))
 
 
 def test_a_missing_device_is_an_error_not_a_fallback():
@@ -231,5 +226,5 @@ def test_a_stray_triangle_is_the_remedy_not_the_camera(tmp_path):
     with pytest.raises(UserError, match=r"1 of the 1281 faces of the source .* index 1280"):
         styleexp.stylize(stray, "bubble", *SMOKE)
     assert "are far from all others" not in str(
-        styleexp.stylize("critter", "bubble", *SMOKE).scene.notes
+        styleexp.stylize("critter", "bubble", *SMOKE).subject.notes
     )

@@ -8,13 +8,13 @@ import torch
 import trimesh
 
 import styleexp
+from styleexp.config import build
 from styleexp.config.compose import compose
 from styleexp.inputs import meshes, shapes
 from styleexp.method import scene
 from styleexp.method.patches import relief_of_mesh
 from styleexp.method.synthesis.direction import FLOW, UP, direction_field, turned
 from styleexp.method.synthesis.exemplar import MeshExemplar, PictureExemplar, measure
-from styleexp.method.synthesis.method import relief_of
 from styleexp.method.synthesis.optimise import bank, matched
 from styleexp.method.synthesis.quilting import quilt
 from styleexp.method.synthesis.room import ball_radius
@@ -217,7 +217,7 @@ def striped():
 
 def test_stripes_on_a_sphere_are_level_and_as_high_as_the_styles(striped):
     """Along up the height changes, across it hardly: a stripe may well be a spiral."""
-    moved, mesh = striped.displacement, striped.scene.source
+    moved, mesh = striped.displacement, striped.subject.source
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     double = np.linalg.norm(normal, axis=1, keepdims=True)
@@ -244,8 +244,8 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_another_relief(strip
 
 def test_strength_zero_gives_the_source_back_and_no_face_turns_over(striped):
     flat = styleexp.stylize("torus", "bubble", *CHEAP, "strength=0")
-    assert (flat.vertices == flat.scene.source.vertices).all()
-    source = trimesh.Trimesh(striped.scene.source.vertices, striped.faces, process=False)
+    assert (flat.vertices == flat.subject.source.vertices).all()
+    source = trimesh.Trimesh(striped.subject.source.vertices, striped.faces, process=False)
     facing = (source.face_normals * striped.trimesh().face_normals).sum(1)
     assert facing.min() > 0
 
@@ -266,8 +266,8 @@ def test_learning_can_start_at_the_synthesis(coarse_shapes):
     """Before the first step it is what ``method=synthesis`` makes."""
     made = styleexp.stylize("torus", "stripe", "source.refine=none", "field.unfold=false")
     config = compose(["method=robust", "source=torus", "style=stripe", "field.start=synthesis"])
-    subject = scene.load(config, relief_of(config))
-    base, notes = scene.start_of(subject)
+    subject = build.subject_of(config, separate=True)
+    base, notes = scene.base_of(subject)
     assert not notes
     assert np.allclose(base.numpy() * subject.frame.scale, made.displacement, atol=1e-6)
 
@@ -280,5 +280,7 @@ def test_flatten_takes_the_sources_own_bumps_off_as_far_as_the_relief_is_high():
     taken = flat.displacement - plain.displacement
     assert np.corrcoef(taken, bumps)[0, 1] < -0.9
     assert np.abs(taken).max() < 2.2 * np.abs(plain.displacement).max()
-    with pytest.raises(UserError, match=r"baseline.flatten=2.0 is not allowed: give 0 to 1\."):
+    with pytest.raises(
+        UserError, match=r"baseline.flatten=2.0 is not allowed: give a value from 0 to 1\."
+    ):
         styleexp.stylize(*given, "baseline.flatten=2")

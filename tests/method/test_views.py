@@ -3,8 +3,8 @@ import math
 import pytest
 import torch
 
-from styleexp.config.schema import LocalViewsConfig, ViewsConfig
 from styleexp.method import views
+from styleexp.method.options import LocalViewsConfig, ViewsConfig
 
 CPU = torch.device("cpu")
 
@@ -69,16 +69,7 @@ def test_a_steps_randomness_depends_on_seed_and_step_alone():
     assert not torch.equal(draw(3, 7), draw(4, 7))
 
 
-def test_cropped_camera_sees_its_window_of_the_frame():
-    cameras = views.sample_global(ViewsConfig(count=2), rng(), CPU)
-    windows = torch.tensor([[0.3, -0.2, 0.1]])
-    crop = views.crop_cameras(cameras, windows, torch.tensor([1]))
-    point = [0.05, 0.1, -0.2]
-    inside = (project(cameras, point)[1] - windows[0, :2]) / 0.1
-    torch.testing.assert_close(project(crop, point)[0], inside)
-
-
-def test_image_crop_shows_the_same_window_as_the_cropped_camera():
+def test_an_image_crop_shows_its_window():
     """Rows go down and NDC's y goes up; a mix-up would show another window."""
     image = torch.zeros(1, 100, 100, 1)
     image[0, 10:20, 60:70] = 1.0  # NDC x in 0.2..0.4, y in 0.6..0.8

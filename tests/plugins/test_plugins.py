@@ -46,7 +46,7 @@ GOOD = """
         return SoftRaster()
 
     def encoder(options, *, device, seed):
-        from styleexp.encoders import load_encoder
+        from styleexp.plugins import load_encoder
         return load_encoder("vgg19_random", precision="fp32", device=device, seed=options.salt)
 
     def style(options):
@@ -54,13 +54,13 @@ GOOD = """
         row = (np.arange(96) // options.period % 2).astype(np.float32)
         return np.broadcast_to(row[:, None, None], (96, 96, 3)).copy()
 
-    def field(options, *, generator, sigma, bound):
-        from styleexp.method.fields import DisplacementField
-        return DisplacementField(options, generator, sigma * options.gain, bound)
+    def field(options, *, points, generator, sigma, bound):
+        from styleexp.method.fields import FourierMLP
+        return FourierMLP(options, generator, sigma * options.gain, bound)
 
     def loss(options, *, encoder):
-        from styleexp.method.losses import StyleLoss
-        class Powered(StyleLoss):
+        from styleexp.method.losses import GramLoss
+        class Powered(GramLoss):
             def distance(self, *given):
                 return super().distance(*given) ** options.power
         return Powered(options, encoder)
@@ -368,7 +368,7 @@ def test_a_style_of_a_plugin_from_python(installed, tmp_path):
         "import styleexp\n"
         "r = styleexp.stylize('torus', 'lab_style', 'method=robust', 'profile=smoke', "
         "'encoder=vgg19_random', 'style.period=24')\n"
-        "print(r.scene.config.style.period, r.scene.style.shape)"
+        "print(r.subject.config.style.period, r.subject.style.shape)"
     )
     done = process(sys.executable, "-c", code, cwd=tmp_path, path=installed)
     assert "24 (96, 96, 3)" in done.stdout, done.stderr

@@ -67,7 +67,7 @@ def test_agrees_with_soft_raster(named_mesh, name: str, normals: str, outlines: 
     smaller than a pixel, if they are flat, and outlines. The hard ones are equal.
     """
     from styleexp.inputs.meshes import load_mesh
-    from styleexp.method.scene import normalised
+    from styleexp.method.surface import normalised
 
     surface = normalised(load_mesh(named_mesh(name)), torch.device("cpu"))[1]
     cameras = orbit(torch.tensor([0.1, -0.4]), torch.tensor([0.4, 2.5]), 2.0, 60.0)

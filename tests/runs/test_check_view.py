@@ -167,8 +167,7 @@ def test_disagreement_is_a_warning_and_in_the_record(any_platform, tmp_path):
             out = super().render(*arguments)
             return replace(out, coverage=out.coverage.flip(2))
 
-    result = finished()
-    result.scene.viewer.renderer = Mirrored()
+    result, config = finished()
     written = []
 
     def write(name, writer):
@@ -177,25 +176,23 @@ def test_disagreement_is_a_warning_and_in_the_record(any_platform, tmp_path):
         return written[-1]
 
     with pytest.warns(UserWarning, match=r"IoU of 0\.\d+ with soft_raster's, .*0\.98"):
-        assert previews.write_check(result, write) == written
+        assert previews.write_check(result, Mirrored(), config, write) == written
     assert json.loads((tmp_path / "check.json").read_text())["least_iou"] < 0.98
-    result.scene.viewer.renderer = SoftRaster()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        previews.write_check(result, write)
+        previews.write_check(result, SoftRaster(), config, write)
 
 
 def finished():
     """The source itself, as the result of no steps."""
+    from styleexp.config.build import prepare
     from styleexp.config.compose import compose
-    from styleexp.method.gram import finish, start
-    from styleexp.method.scene import prepare
 
     config = compose(["source=critter", *SMOKE[1:], "preview=pyrender"])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        scene = prepare(config)
-    return finish(scene, start(scene))
+        method, scene = prepare(config)
+    return method.finish(scene, method.start(scene)), config
 
 
 def test_without_opengl_a_run_stops_before_it_begins(tmp_path):

@@ -85,7 +85,7 @@ def test_a_good_checkpoint_outlives_the_next_one_saved_after_a_damaged_one(tmp_p
     """What is damaged must not take the place of the one before it."""
     import torch
 
-    from styleexp.method.gram import State
+    from styleexp.method.base import State
 
     def state(step):
         field = torch.nn.Linear(3, 2)
@@ -113,7 +113,7 @@ def test_a_good_checkpoint_outlives_the_next_one_saved_after_a_damaged_one(tmp_p
 def test_with_both_checkpoints_damaged_the_run_begins_anew(tmp_path):
     import torch
 
-    from styleexp.method.gram import State
+    from styleexp.method.base import State
 
     field = torch.nn.Linear(3, 2)
     begun = State(field, torch.optim.Adam(field.parameters()))

@@ -12,9 +12,9 @@ from PIL import Image
 from styleexp.config import compose
 from styleexp.experiments import execute as command
 from styleexp.plugins import discovery
+from styleexp.plugins.loggers import Loggers
 from styleexp.runs import records
 from styleexp.runs.identity import essence, job_key
-from styleexp.plugins.loggers import Loggers
 from styleexp.system.errors import UserError
 
 SMOKE = (

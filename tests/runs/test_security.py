@@ -145,8 +145,7 @@ def test_a_page_of_a_strangers_run_shows_no_file_that_the_run_did_not_use(tmp_pa
 def test_a_checkpoint_with_a_pickle_inside_is_damaged_not_run(tmp_path):
     import pickle
 
-    from styleexp.method.gram import start
-    from styleexp.method.scene import prepare
+    from styleexp.config.build import prepare
     from styleexp.runs.records import RunFolder, read_record
 
     class Evil:
@@ -155,7 +154,7 @@ def test_a_checkpoint_with_a_pickle_inside_is_damaged_not_run(tmp_path):
 
     (tmp_path / "checkpoint.safetensors").write_bytes(pickle.dumps(Evil()))
     with one_encoder():
-        scene = prepare(
+        method, scene = prepare(
             compose.compose(
                 [
                     "method=robust",
@@ -166,7 +165,7 @@ def test_a_checkpoint_with_a_pickle_inside_is_damaged_not_run(tmp_path):
                 ]
             )
         )
-    state = start(scene)
+    state = method.start(scene)
     told = RunFolder(tmp_path).load_checkpoint(state)
     assert told is not None
     assert "damaged" in told

@@ -296,6 +296,7 @@ def _explained(steps: Iterator[Step], folder: records.RunFolder) -> Iterator[Ste
 def _write_results(
     result: Result, config: Config, folder: records.RunFolder
 ) -> tuple[list[Path], dict[str, float]]:
+    from styleexp import plugins
     from styleexp.runs import previews
 
     for name in ("result.ply", "result.obj", "result.glb"):
@@ -318,7 +319,9 @@ def _write_results(
     folder.write_json("metrics.json", found)
     print("  ".join(f"{name} {found[name]:.3g}" for name in SHOWN_METRICS if name in found))
     if config.preview.name == "pyrender":
-        written += previews.write_check(result, config, folder.write)
+        written += previews.write_check(
+            result, plugins.build("renderer", config.renderer), config, folder.write
+        )
     return written, found
 
 

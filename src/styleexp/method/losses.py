@@ -3,6 +3,7 @@ comparison."""
 
 from __future__ import annotations
 
+import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -173,7 +174,9 @@ class GramLoss(Loss):
         """Decide ``loss.masked=pictures`` for this style."""
         if self.config.masked != "pictures":
             return self
-        return GramLoss(replace(self.config, masked=style.picture is not None), self.encoder)
+        loss = copy.copy(self)
+        loss.config = replace(self.config, masked=style.picture is not None)
+        return loss
 
     def describe(self, seen: Images) -> Statistics:
         """One Gram per style layer, over the foreground only if configured."""

@@ -23,7 +23,6 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
 
-from styleexp import plugins
 from styleexp.inputs import meshes
 from styleexp.method.views import orbit, zoom
 from styleexp.renderers.base import Cameras, Renderer, Shading
@@ -244,7 +243,10 @@ def silhouette_iou(
 
 
 def write_check(
-    result: Result, config: Config, write: Callable[[str, Callable[[Path], Any]], Path]
+    result: Result,
+    renderer: Renderer,
+    config: Config,
+    write: Callable[[str, Callable[[Path], Any]], Path],
 ) -> list[Path]:
     """Write ``check.png``, ``check.gif`` and ``check.json``: the result drawn by pyrender.
 
@@ -260,7 +262,6 @@ def write_check(
     elevations = [v[1] for v in VIEWS] + [15.0] * frames
     azimuths = [v[2] for v in VIEWS] + [360.0 * i / frames for i in range(frames)]
     cameras = framed(points, elevations, azimuths)
-    renderer = plugins.build("renderer", config.renderer)
     size, views = preview.check_resolution, slice(0, len(VIEWS))
     drawn = check_views(vertices, faces, cameras, size, preview.platform)
     ious, own = silhouette_iou(
