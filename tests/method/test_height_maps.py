@@ -109,6 +109,6 @@ def test_a_style_too_coarse_for_a_height_map_is_told_and_starts_at_the_source(tm
     faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
     mesh = meshes.Mesh("octahedron", octahedron, np.array(faces))
     meshes.save_mesh(mesh, mesh.vertices, tmp_path / "octahedron.ply")
-    method, scene = prepare(compose([*SMALL, f"style.path={tmp_path}/octahedron.ply"]))
+    _, scene = prepare(compose([*SMALL, f"style.path={tmp_path}/octahedron.ply"]))
     assert scene.base is None
     assert any("'octahedron' is too coarse for a height map" in note for note in scene.notes)

@@ -368,7 +368,7 @@ def test_a_style_of_a_plugin_from_python(installed, tmp_path):
         "import styleexp\n"
         "r = styleexp.stylize('torus', 'lab_style', 'method=robust', 'profile=smoke', "
         "'encoder=vgg19_random', 'style.period=24')\n"
-        "print(r.subject.config.style.period, r.subject.style.shape)"
+        "print(r.subject.settings.style.period, r.subject.style.picture.shape)"
     )
     done = process(sys.executable, "-c", code, cwd=tmp_path, path=installed)
     assert "24 (96, 96, 3)" in done.stdout, done.stderr
@@ -474,7 +474,13 @@ def test_the_example_in_a_fresh_environment(tmp_path):
         "from styleexp import plugins, testing\n"
         "options = plugins.find('renderer', 'example_normals').spec.config()\n"
         "outcomes = testing.check_renderer(plugins.build('renderer', options))\n"
-        "assert set(outcomes.values()) == {'passed'}, outcomes"
+        "assert set(outcomes.values()) == {'passed'}, outcomes\n"
+        "import functools\n"
+        "encoder = plugins.load_encoder('vgg19_random')\n"
+        "options = plugins.find('loss', 'example_moments').spec.config(name='example_moments')\n"
+        "testing.check_loss(plugins.build('loss', options, encoder=encoder))\n"
+        "options = plugins.find('field', 'example_waves').spec.config(name='example_waves')\n"
+        "testing.check_field(functools.partial(plugins.build, 'field', options))\n"
     )
     done = process(python, "-c", code, cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -2,8 +2,8 @@
 
 Hydra validates against these dataclasses. The command line and ``styleexp.stylize(...)`` start from
 ``conf/config.yaml``, whose ``method=synthesis`` sets ``baseline`` and ``source.refine``;
-``conf/method`` holds the presets and ``conf/profile`` the sizes. The options of each part are beside
-it: `method.options`, `encoders.options`, `renderers.options` and so on. This module imports nothing
+``conf/method`` holds the presets and ``conf/profile`` the sizes. Each part's options are beside it:
+`method.options`, `encoders.options`, `renderers.options` and so on. This module imports nothing
 heavy, to keep ``styleexp --help`` fast.
 """
 

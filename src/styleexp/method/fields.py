@@ -105,7 +105,7 @@ class FourierMLP(Field):
         self.centred = config.zero_mean
         self.encode = FourierFeatures(config.features, sigma, config.include_input, generator)
         sizes = [self.encode.size] + [config.width] * (config.depth - 1) + [1]
-        linears = [nn.Linear(a, b) for a, b in itertools.pairwise(sizes)]
+        linears = [nn.utils.skip_init(nn.Linear, a, b) for a, b in itertools.pairwise(sizes)]
         for layer in linears:  # torch's default initialisation, with our generator
             span = 1 / math.sqrt(layer.in_features)
             nn.init.uniform_(layer.weight, -span, span, generator=generator)

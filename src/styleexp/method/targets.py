@@ -43,13 +43,13 @@ class FixedTarget:
         self.statistics = whole, local
 
     def __call__(self, step: int) -> tuple[Statistics, Statistics]:
-        """The constant Statistics, for any step."""
+        """The constant statistics, for any step."""
         return self.statistics
 
 
 class RenderedTarget:
-    """Statistics of the style mesh, rendered in every step: at the generated mesh's views, as in the
-    paper, or at those of ``later`` steps, so that the two see different views."""
+    """Statistics of the style mesh, rendered in every step: at the generated mesh's views, as in
+    the paper, or at those of ``later`` steps, so that the two see different views."""
 
     def __init__(
         self, loss: Loss, viewer: Viewer, vertices: Float[Tensor, "vertices 3"], later: int = 0

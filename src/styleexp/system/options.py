@@ -1,8 +1,8 @@
 """Limits of options, declared with the dataclass fields they belong to.
 
-Options are plain dataclasses, of built-in parts and of plugins alike. A field with limits is written
-``sigma: float = option(5.0, between=(0.001, 1000))``, followed by a string with its meaning; `check`
-validates an instance. Hydra checks the types.
+Options are plain dataclasses, of built-in parts and of plugins alike. A field with limits is
+written ``sigma: float = option(5.0, between=(0.001, 1000))``, followed by a string with its
+meaning; `check` validates an instance. Hydra checks the types.
 """
 
 from __future__ import annotations

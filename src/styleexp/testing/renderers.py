@@ -25,6 +25,8 @@ from typing import TYPE_CHECKING
 import torch
 
 from styleexp.renderers.base import Cameras, Renderer, RenderOutput, Shading
+from styleexp.testing import checks
+from styleexp.testing.checks import NotApplicable
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -34,30 +36,12 @@ EVEN = Shading(albedo=0.25, ambient=1.0, light=(0.0, 0.0, 0.0))
 """Shading with intensity 0.25 everywhere, so that only outlines show."""
 
 
-class NotApplicable(Exception):
-    """The backend doesn't claim the checked property."""
-
-
 Check = Callable[[Renderer], None]
 
 
 def check_renderer(renderer: Renderer) -> dict[str, str]:
-    """Run every check; return the outcomes, ``passed`` or ``not applicable: ...``, by name.
-
-    After all have run, raises ``AssertionError`` that lists the failed checks.
-    """
-    outcomes, failures = {}, []
-    for check in CHECKS:
-        try:
-            check(renderer)
-            outcomes[check.__name__] = "passed"
-        except NotApplicable as reason:
-            outcomes[check.__name__] = f"not applicable: {reason}"
-        except Exception as error:  # a backend's own exceptions are failures too
-            failures.append(f"{check.__name__}: {type(error).__name__}: {error}")
-    if failures:
-        raise AssertionError(f"{len(failures)} checks failed:\n" + "\n".join(failures))
-    return outcomes
+    """Run every check; see `checks.run`."""
+    return checks.run(CHECKS, renderer)
 
 
 # What is visible

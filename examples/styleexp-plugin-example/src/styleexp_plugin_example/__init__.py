@@ -1,1 +1,1 @@
-"""A plugin of styleexp: the renderer ``example_normals``."""
+"""A plugin of styleexp: a renderer, a loss and a field."""

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import torch
 
-from styleexp.renderers.base import Renderer, RenderOutput
+from styleexp.renderers.base import Renderer, RenderOutput, one_light_at_a_time
 from styleexp.renderers.soft_raster import SoftRaster
 
 
@@ -18,6 +18,7 @@ class Normals(Renderer):
         self.turn = turn
         self.grey = SoftRaster()
 
+    @one_light_at_a_time
     def render(self, vertices, faces, cameras, shading, resolution) -> RenderOutput:
         """Render once for each light; see ``Renderer.render``."""
         light = torch.as_tensor(shading.light).to(vertices).expand(len(cameras), 3)
