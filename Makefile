@@ -30,10 +30,11 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check \
 STRESS_FUZZ ?= 50
 STRESS_SECONDS ?= 3600
 
-# Tests of functions, in the tests' own process.
-QUICK := experiments/collect method/fields inputs/gltf method/height_maps method/losses \
-	inputs/ply_obj inputs/refining method/relief method/remembered inputs/shapes method/views \
-	inputs/welding
+# Tests of functions, in the tests' own process; those of them that are marked as slow are left out.
+QUICK := $(addprefix tests/,encoders system \
+	$(addprefix inputs/test_,gltf.py images.py meshes.py ply_obj.py refining.py shapes.py welding.py) \
+	$(addprefix method/test_,fields.py height_maps.py losses.py masks.py relief.py remembered.py \
+	styles.py views.py) experiments/test_collect.py experiments/test_reports_study.py)
 
 # On busy cores, spinning OpenMP threads make everything many times slower.
 export OMP_WAIT_POLICY ?= PASSIVE
@@ -51,7 +52,7 @@ test: $(VENV)/.installed-dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
 
 test-quick: $(VENV)/.installed-dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal $(foreach each,$(QUICK),tests/$(dir $(each))test_$(notdir $(each)).py)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal -m 'not slow' $(QUICK)
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

@@ -115,6 +115,7 @@ def test_too_many_faces_are_refused(monkeypatch):
         meshes.refine(mesh, 0.05)
 
 
+@pytest.mark.slow
 def test_a_run_refines_for_its_style_and_says_so():
     from styleexp.config.build import subject_of
     from styleexp.method import refinement
@@ -129,6 +130,7 @@ def test_a_run_refines_for_its_style_and_says_so():
     assert not any("is too coarse" in note for note in fine.notes)
 
 
+@pytest.mark.slow
 def test_a_run_refines_to_a_number_of_faces():
     from styleexp.config.build import prepare, subject_of
 

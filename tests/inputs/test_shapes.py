@@ -75,6 +75,7 @@ def test_made_again_it_is_the_same_even_in_another_process(shape):
     np.testing.assert_array_equal(again.faces, shape.faces)
 
 
+@pytest.mark.slow
 def test_critter_is_the_same_in_another_process():
     code = (
         "import hashlib; from styleexp.inputs import shapes; m = shapes.make('critter', 3000);"

@@ -64,6 +64,7 @@ def test_patch_of_a_mesh_file_shows_the_same_relief_as_the_analytic_style():
     assert np.corrcoef(exact.ravel(), measured.ravel())[0, 1] > 0.9
 
 
+@pytest.mark.slow
 def test_the_field_starts_at_the_height_map_and_learns_within_its_share():
     method, scene = prepare(compose([*SMALL, "style=bubble"]))
     state = method.start(scene)
@@ -84,6 +85,7 @@ def test_the_field_starts_at_the_height_map_and_learns_within_its_share():
     assert displace(scene, state, torch.float32).abs().max() <= scene.subject.bound
 
 
+@pytest.mark.slow
 def test_the_papers_field_starts_at_the_source_and_has_the_whole_bound():
     method, scene = prepare(compose([*SMALL, "style=bubble", "field.start=source"]))
     assert scene.base is None

@@ -113,6 +113,7 @@ def test_a_thin_parts_other_side_is_not_in_the_border():
     assert (soft[inside & (mesh.vertices[:, 1] > 0)] == 1).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [MAP, CHEAP])
 def test_beyond_the_mask_no_bit_moves_and_within_it_the_mean_is_zero(options):
     given = painted_ball(right=right)
@@ -125,6 +126,7 @@ def test_beyond_the_mask_no_bit_moves_and_within_it_the_mean_is_zero(options):
     assert abs(moved.sum()) < 0.02 * np.abs(moved).sum()  # where no face turned over, 0
 
 
+@pytest.mark.slow
 def test_the_learned_field_keeps_within_the_mask():
     from types import SimpleNamespace
 
@@ -144,6 +146,7 @@ def test_the_learned_field_keeps_within_the_mask():
     assert abs(float((moved * subject.areas).sum())) < 1e-4
 
 
+@pytest.mark.slow
 def test_two_runs_with_the_two_halves_put_two_styles_on_one_mesh(tmp_path):
     painted_ball(right=right).export(tmp_path / "ball.ply")
     first = styleexp.stylize(tmp_path / "ball.ply", "stripe", *MAP, "style.mask=attribute:right")
@@ -189,6 +192,7 @@ def test_values_that_are_no_shares_are_refused():
         styleexp.stylize(given, "bubble", *MAP, "style.mask=attribute:paint")
 
 
+@pytest.mark.slow
 def test_a_masks_picture_is_a_file_of_the_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     mask = "style.mask=not:texture:a picture, really.png"
@@ -225,6 +229,7 @@ def test_paths_of_pictures_are_replaced_in_their_order():
     assert masks.with_files(None, []) is None
 
 
+@pytest.mark.slow
 def test_a_direction_of_the_file_is_followed_and_turned():
     def around(vertices):  # the x axis
         return 3 * np.cross([1.0, 0.0, 0.0], vertices).astype(np.float32)

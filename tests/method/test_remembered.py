@@ -43,6 +43,7 @@ def test_the_second_run_measures_nothing_and_has_the_same_bits(made):
     assert all(map(torch.equal, grams(first), grams(second)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changed",
     [

@@ -1,13 +1,10 @@
 """Some of the trials of fault_trials.py; `make stress` and benchmarks/faults.py try them all."""
 
-import os
 import random
-import time
 
 import pytest
 
 from styleexp.runs import records
-from styleexp.system import atomic
 from tests.helpers.fault_trials import FAULTS, Missing, Stage, kill_run
 
 
@@ -38,47 +35,6 @@ def test_what_a_fault_leaves_can_be_gone_on_with(name, stage):
         FAULTS[name].tried(stage, random.Random(name))
     except Missing as missing:
         pytest.skip(str(missing))
-
-
-def test_a_writer_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
-    target = tmp_path / "file.txt"
-    atomic.write(target, atomic.text("old"))
-
-    def fail(path):
-        path.write_text("half of the n")
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        atomic.write(target, fail)
-    assert [path.name for path in tmp_path.iterdir()] == ["file.txt"]
-    assert target.read_text() == "old"
-
-
-def test_content_and_name_are_on_the_disk_before_a_writer_returns(tmp_path, monkeypatch):
-    done = []
-    for name in ("fsync", "replace"):
-        real = getattr(os, name)
-        monkeypatch.setattr(
-            os, name, lambda *given, real=real, name=name: (done.append(name), real(*given))
-        )
-    atomic.write(tmp_path / "file.txt", atomic.text("new"))
-    assert done == ["fsync", "replace", "fsync"]
-
-
-def test_only_what_dead_writers_left_is_swept_away(tmp_path):
-    kept = ["result.ply", ".hidden", "my.partial.ply"]
-    for name in [*kept, ".result.01234567.partial.ply"]:
-        (tmp_path / name).write_text("x")
-    (tmp_path / ".fetch.partial-abc").mkdir()
-    (tmp_path / ".fetch.partial-abc" / "half").write_text("x")
-    atomic.sweep(tmp_path, seconds=60)
-    assert len(list(tmp_path.iterdir())) == len(kept) + 2
-    old = time.time() - 3600
-    os.utime(tmp_path / ".fetch.partial-abc", (old, old))
-    atomic.sweep(tmp_path, seconds=60)
-    assert not (tmp_path / ".fetch.partial-abc").exists()
-    atomic.sweep(tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(kept)
 
 
 def test_a_good_checkpoint_outlives_the_next_one_saved_after_a_damaged_one(tmp_path):
