@@ -43,7 +43,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Run or continue a plan of experiments: finished jobs are skipped, killed "
         "jobs are resumed. Any number of runners may share a folder.",
         epilog="styleexp-sweep status FOLDER shows every job; styleexp-sweep collect FOLDER writes "
-        "reading.csv and reading.parquet.",
+        "runs.csv and runs.parquet.",
     )
     parser.add_argument("plan", type=Path, metavar="PLAN", help="a plan file, see sweeps/")
     parser.add_argument(

@@ -47,7 +47,7 @@ def collect(folder: str | Path) -> pandas.DataFrame:
 
 
 def write(frame: pandas.DataFrame, folder: str | Path) -> list[Path]:
-    """Write ``reading.csv`` and ``reading.parquet``; return their paths.
+    """Write ``runs.csv`` and ``runs.parquet``; return their paths.
 
     Parquet columns have a single type: columns of mixed types are written as text.
     """
@@ -60,10 +60,10 @@ def write(frame: pandas.DataFrame, folder: str | Path) -> list[Path]:
         if len(kinds - {int, float}) > (0 if kinds & {int, float} else 1):
             typed[name] = typed[name].map(str, na_action="ignore")
     try:
-        parquet = target.write("reading.parquet", lambda path: typed.to_parquet(path, index=False))
+        parquet = target.write("runs.parquet", lambda path: typed.to_parquet(path, index=False))
     except ImportError:
         raise UserError("Parquet needs pyarrow: pip install 'styleexp[report]'.") from None
-    return [target.write("reading.csv", lambda path: frame.to_csv(path, index=False)), parquet]
+    return [target.write("runs.csv", lambda path: frame.to_csv(path, index=False)), parquet]
 
 
 def _runs(folder: Path, asked: Iterable[Path]) -> dict[str, dict[str, str]]:
