@@ -20,9 +20,9 @@ import pytest
 import torch
 from corpus import _whole, obj, picture
 
-from styleexp.config.schema import Config, check
 from styleexp.config.compose import compose
 from styleexp.config.explain import explain
+from styleexp.config.schema import Config, check
 from styleexp.inputs import meshes
 from styleexp.inputs.images import load_image
 from styleexp.method.views import look_at, orbit

@@ -12,9 +12,9 @@ import warm
 from PIL import Image
 
 import styleexp
-from styleexp.config.schema import StyleConfig, sources
 from styleexp.config.compose import compose
 from styleexp.config.overrides import understood
+from styleexp.config.schema import StyleConfig, sources
 from styleexp.inputs import meshes
 from styleexp.method import masks, scene
 from styleexp.method.synthesis.method import directions

@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 import styleexp
-from styleexp.config.schema import Config, StyleConfig, sources
 from styleexp.config.compose import compose
+from styleexp.config.schema import Config, StyleConfig, sources
 from styleexp.method import pictures, scene
 from styleexp.method.height_maps import picture_side
 from styleexp.system.errors import UserError
