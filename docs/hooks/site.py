@@ -32,7 +32,7 @@ API = {
                   "renderers.mitsuba_ad", "renderers.moderngl_deferred", "testing"),
     "Encoders": ("encoders", "encoders.vgg", "encoders.fused", "encoders.clip", "encoders.weights"),
     "Parts and plugins": ("plugins.spec", "plugins", "runs.loggers", "system.errors"),
-    "Runs, metrics, reports": ("runs.records", "runs.identity", "runs.origins", "experiments.metrics", "experiments.metrics.style", "experiments.metrics.shape",
+    "Runs, metrics, reports": ("runs.records", "runs.reading", "runs.finding", "runs.jobs", "runs.results", "runs.untrusted", "runs.identity", "runs.origins", "experiments.execute", "experiments.metrics", "experiments.metrics.style", "experiments.metrics.shape",
                                "experiments.metrics.truth", "experiments.reports", "experiments.reports.collect",
                                "experiments.reports.reliability", "experiments.reports.study_results", "experiments.sweeps.claim", "experiments.sweeps.plan", "experiments.sweeps.runner", "experiments.agreement", "method.gram_cache", "experiments.bench.render", "experiments.bench.step"),
 }  # fmt: skip

@@ -28,8 +28,8 @@ def varying(jobs: Sequence[Sequence[str]]) -> list[dict[str, str]]:
     """For each job, the overrides that not all jobs share, without Hydra's ``+``."""
     split = [dict(_pair(override) for override in overrides) for overrides in jobs]
     keys = dict.fromkeys(key for each in split for key in each)
-    told = [key for key in keys if len({each.get(key) for each in split}) > 1]
-    return [{key: each[key] for key in told if key in each} for each in split]
+    differing = [key for key in keys if len({each.get(key) for each in split}) > 1]
+    return [{key: each[key] for key in differing if key in each} for each in split]
 
 
 def setting(overrides: Mapping[str, str]) -> str:
