@@ -7,16 +7,14 @@ three end in `_guarded`, which writes the final status whatever happens in `_exe
 from __future__ import annotations
 
 import os
-import re
 import shlex
-import signal
 import sys
 import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from styleexp.experiments import progress
+from styleexp.experiments import endings, progress
 from styleexp.experiments.sweeps.claim import PATIENCE, busy
 from styleexp.runs import identity, origins, reading, records
 from styleexp.runs.jobs import Job
@@ -121,7 +119,7 @@ def _guarded(
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
-        raise _failed_writing(folder, error) from error
+        raise endings.failed_writing(folder, error) from error
     except KeyboardInterrupt:
         if folder.begun:
             folder.write_status("interrupted", reason="stopped by the user")
@@ -129,64 +127,12 @@ def _guarded(
                 print(f"\nstopped; rerun with: {_resuming(folder)}", file=sys.stderr)
         raise
     except Exception as error:
-        if not _is_out_of_memory(error):
-            _fail(folder, str(error))
+        if not endings.is_out_of_memory(error):
+            endings.fail(folder, str(error))
             raise
-        message = _out_of_memory(config, error)
-        _fail(folder, message)
+        message = endings.out_of_memory(config, error)
+        endings.fail(folder, message)
         raise UserError(message) from error
-
-
-def _failed_writing(folder: records.RunFolder, error: OSError) -> UserError:
-    """Record a failure of the file system, and return it as an error for the user."""
-    if not folder.path.is_dir():
-        return UserError(
-            f"the run's folder '{folder.path}' was removed during the run: start the run again."
-        )
-    if isinstance(error, FileNotFoundError) and _is_within(error.filename, folder.path):
-        message = (
-            f"files of the run's folder '{folder.path}' were removed during the run: start the "
-            "run again."
-        )
-        folder.forget()
-        _fail(folder, message)
-        return UserError(message)
-    _fail(folder, str(error))
-    return UserError(
-        f"writing to '{folder.path}' failed ({error.strerror or error}): free some space or "
-        "choose another folder with hydra.run.dir=FOLDER."
-    )
-
-
-def _is_within(name: object, folder: Path) -> bool:
-    if not isinstance(name, str | Path):
-        return False
-    return Path(os.path.abspath(name)).is_relative_to(os.path.abspath(folder))
-
-
-def _is_out_of_memory(error: BaseException) -> bool:
-    """Whether Python, torch's CPU allocator or CUDA ran out of memory."""
-    import torch
-
-    kinds = (MemoryError, torch.OutOfMemoryError)
-    return isinstance(error, kinds) or "can't allocate memory" in str(error)
-
-
-def _out_of_memory(config: Config, error: BaseException) -> str:
-    """What to do about a lack of memory."""
-    asked = re.search(r"allocate (\d+) bytes", str(error))
-    more = f" (failed to allocate {int(asked[1]) / 1e6:.0f} MB)" if asked else ""
-    views = "fewer or smaller views (views.count, views.resolution), "
-    return (
-        f"there is not enough memory for this run{more}: use "
-        f"{'' if config.baseline else views}a mesh with fewer faces, or fewer runs at once."
-    )
-
-
-def _fail(folder: records.RunFolder, reason: str) -> None:
-    with suppress(OSError):  # report the error even if it can't be recorded
-        if folder.begun:
-            folder.write_status("failed", reason=reason)
 
 
 def _resuming(folder: records.RunFolder) -> str:
@@ -310,7 +256,7 @@ def _optimise(
     """Run the remaining steps; return False if the user stopped them."""
     optim = scene.config.optim
     blank = 0
-    with _interruptible() as interrupted:
+    with endings.interruptible() as interrupted:
         steps = _explained(method.optimise(scene, state), folder)
         for step in progress.shown(steps, state.step, optim.steps):
             folder.append_metrics(step)
@@ -345,30 +291,6 @@ def _explained(steps: Iterator[Step], folder: records.RunFolder) -> Iterator[Ste
         if good is not None:
             kept = f"The last good checkpoint is from step {good}: {folder.checkpoint}."
         raise UserError(f"{error} {kept}") from None
-
-
-@contextmanager
-def _interruptible() -> Iterator[list[int]]:
-    """Yield a list that the first Ctrl-C (or SIGTERM, or a closed terminal) appends to; a second
-    one stops at once."""
-    caught: list[int] = []
-
-    def note(number: int, frame: Any) -> None:
-        if caught:
-            raise KeyboardInterrupt
-        caught.append(number)
-
-    signals = [signal.SIGINT, signal.SIGTERM]
-    # Windows has no SIGHUP, and nohup ignores it.
-    hangup = getattr(signal, "SIGHUP", None)
-    if hangup is not None and signal.getsignal(hangup) is not signal.SIG_IGN:
-        signals.append(hangup)
-    before = {s: signal.signal(s, note) for s in signals}
-    try:
-        yield caught
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 # ------------------------------------------------------------------------------------------ result
