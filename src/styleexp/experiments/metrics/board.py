@@ -122,9 +122,8 @@ def _finished(
     """Record, configuration, source, style and result of a finished run."""
     run = reading.recorded(folder, "measure")
     if run.status != "done":
-        raise UserError(
-            f"the run in '{folder}' is not done ({run.status}): there is no result yet."
-        )
+        status = run.last_status or run.status
+        raise UserError(f"the run in '{folder}' is {status}, not done: there is no result yet.")
     config = origins.restored(run.record, folder, "measure")
     source, style = load_source(config.source), load_style(config.style)
     return run.record, config, source, style, *read_result(folder / results.NAME, source)
