@@ -32,7 +32,7 @@ API = {
                   "renderers.mitsuba_ad", "renderers.moderngl_deferred", "testing"),
     "Encoders": ("encoders", "encoders.vgg", "encoders.fused", "encoders.clip", "encoders.weights"),
     "Parts and plugins": ("plugins.spec", "plugins", "plugins.loggers", "system.errors"),
-    "Runs, metrics, reports": ("runs.records", "runs.identity", "runs.origins", "experiments.metrics", "experiments.metrics.style", "experiments.metrics.shape",
+    "Runs, metrics, reports": ("runs.records", "runs.reading", "runs.finding", "runs.jobs", "runs.results", "runs.untrusted", "runs.identity", "runs.origins", "experiments.execute", "experiments.metrics", "experiments.metrics.style", "experiments.metrics.shape",
                                "experiments.metrics.truth", "experiments.reports", "experiments.reports.collect",
                                "experiments.reports.reliability", "experiments.reports.study_results", "experiments.sweeps.claim", "experiments.sweeps.plan", "experiments.sweeps.runner", "experiments.agreement", "method.gram_cache", "experiments.bench.render", "experiments.bench.step"),
 }  # fmt: skip
@@ -85,7 +85,7 @@ def repository_link(text, target, anchor, page):
         raise PluginError(f"docs/{page} links to {target}, which isn't there")
     if PACKAGE in path.parents:
         name = ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__")
-        if name == "config.schema":
+        if name == "config":
             return f"[{text}](reference/configuration.md)"
         if any(name in modules for modules in API.values()):
             return f"[{text}]({api_page(name)})"
@@ -93,7 +93,7 @@ def repository_link(text, target, anchor, page):
     return text if path.name in text.strip("`") or told in text else f"{text} (`{told}`)"
 
 
-def on_post_page(output, page, config):
+def on_post_page(output, page, schema):
     """Refuse a page that would ask another machine for something. The search's helper for file://,
     which the theme would load from elsewhere, is here."""
     output = output.replace(SHIM, relative(page.url) + "assets/iframe-worker.js")
@@ -175,7 +175,7 @@ def configuration():
     return "\n\n".join(out) + "\n"
 
 
-def _section(module, name, prefix, schema):
+def _section(module, name, prefix):
     written = module[name]
     rows, nested = [], []
     for field in dataclasses.fields(getattr(schema, name)):

@@ -43,7 +43,7 @@ def test_a_row_holds_everything(tmp_path):
         "status": "done",
         "seconds": 12.5,
         "device": "cpu",
-        "loss": 39.0,  # steps 38 to 40; the line after them is cut off
+        "loss": 38.5,  # steps 37 to 40; the line after them is cut off
         "config.source.name": "spot",
         "config.optim.steps": 4,
         "config.loss.layers": '["conv1_1", "conv2_1"]',
@@ -91,7 +91,7 @@ def test_what_cannot_be_read_is_a_row_that_says_so(tmp_path):
     (tmp_path / "b" / "status.json").write_text("[]")
     frame = collect(tmp_path).set_index("run")
     assert frame.loc["a", "status"] == "done"
-    assert "run.json can't be read" in frame.loc["a", "reason"]
+    assert "run.json cannot be read" in frame.loc["a", "reason"]
     assert frame.loc["b", "status"] == "unreadable"
 
 

@@ -14,9 +14,10 @@ from styleexp.config import schema
 from styleexp.config.compose import compose
 from styleexp.experiments.sweeps import figure, report
 from styleexp.experiments.sweeps.figure import Shown, layout
-from styleexp.experiments.sweeps.jobs import Job, setting, varying
 from styleexp.experiments.sweeps.plan import experiment_jobs
+from styleexp.experiments.sweeps.settings import setting, varying
 from styleexp.inputs import assets, meshes, shapes
+from styleexp.runs.jobs import Job
 from tests.helpers import ROOT, warm
 
 CONF = ROOT / "conf"

@@ -6,6 +6,7 @@ import hashlib
 import json
 import re
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from styleexp.cli.report import main
 from styleexp.experiments.reports import charts, glb, html, page, shown, sweep_page
 from styleexp.inputs import shapes
 from styleexp.inputs.meshes import load_mesh, save_mesh, vertex_normals
-from styleexp.runs import folders
+from styleexp.runs import finding, reading
 from styleexp.system.errors import UserError
 
 EVIL = '<img src=x onerror="alert(1)">'
@@ -157,7 +158,7 @@ def test_every_finished_run_leaves_its_page(finished):
 
 def test_a_page_names_the_method(tmp_path):
     def named(config):
-        run = folders.Run(tmp_path, record={"config": config})
+        run = reading.Run(tmp_path, record={"config": config})
         return dict(page.facts(run, shown.Shown())).get("method")
 
     assert named({"baseline": {"name": "synthesis"}}) == "synthesis"
@@ -225,7 +226,7 @@ def test_page_of_a_damaged_run_says_what_is_damaged(tmp_path):
     (tmp_path / "result.ply").write_bytes(b"ply\nnonsense")
     text = page.rewrite(tmp_path).read_text()
     assert "run.json cannot be read" in text
-    assert "result.ply cannot be read" in text
+    assert "result.ply&#39; has an unterminated header" in text
     assert "1 damaged lines" in text
     assert "no &lt;b&gt; memory" in text
     assert 'class="state failed"' in text
@@ -246,7 +247,7 @@ def test_page_of_twenty_thousand_faces_is_far_below_eight_megabytes(tmp_path):
     shape = shown.Shape(vertices, faces)
     shows = shown.Shown(shape, shape, shape, radius.ravel() - 1)
     assert len(faces) == 20_000
-    text = page.build(folders.read(tmp_path), shows)
+    text = page.build(reading.read(tmp_path), shows)
     assert len(text.encode()) < 5e6
 
 
@@ -300,12 +301,12 @@ def sweep(tmp_path):
 
 
 def test_grid_has_failed_and_missing_cells_and_seeds_share_one(sweep):
-    runs = folders.find(sweep)
-    assert [run.state for run in runs] == ["done", "done", "done", "failed", "missing"]
+    runs = finding.find(sweep)
+    assert [run.status for run in runs] == ["done", "done", "done", "failed", "missing"]
     (only,) = sweep_page.split(sweep, runs)
     assert only.axes == {"layers": ["low", "high"], "field.sigma": ["2", "10"]}
     (grid,) = only.grids
-    states = [[[run.state for run in cell.runs] for cell in cells] for _, cells in grid.rows]
+    states = [[[run.status for run in cell.runs] for cell in cells] for _, cells in grid.rows]
     assert states == [[["done", "done"], ["done"]], [["failed"], ["missing"]]]
     text = sweep_page.write(sweep).read_text()
     assert EVIL not in text
@@ -334,7 +335,7 @@ def test_pictures_are_the_previews_own_views(tmp_path):
 
 def test_axes_are_sorted_as_numbers_and_a_third_makes_sheets():
     def run(number, *given):
-        return folders.Run(folders.Path(f"s/{number}"), overrides=list(given))
+        return reading.Run(Path(f"s/{number}"), overrides=list(given))
 
     runs = [
         run(n, f"a={a}", f"b={b}", f"+c={c}", "hydra.x=1")
@@ -342,7 +343,7 @@ def test_axes_are_sorted_as_numbers_and_a_third_makes_sheets():
             (a, b, c) for a in (10, 9) for b in ("x", "y") for c in ("p", "q")
         )
     ]
-    (only,) = sweep_page.split(folders.Path("s"), runs[:-1])
+    (only,) = sweep_page.split(Path("s"), runs[:-1])
     assert only.axes == {"a": ["9", "10"], "b": ["x", "y"], "c": ["p", "q"]}
     assert [grid.title for grid in only.grids] == ["c=p", "c=q"]
     empty = [cell for _, cells in only.grids[1].rows for cell in cells if not cell.runs]
@@ -353,7 +354,7 @@ def test_several_sweeps_keep_apart(tmp_path):
     write_run(tmp_path / "one" / "0", ["a=1"])
     write_run(tmp_path / "one" / "1", ["a=2"])
     write_run(tmp_path / "two" / "0", ["b=1"])
-    sweeps = sweep_page.split(tmp_path, folders.find(tmp_path))
+    sweeps = sweep_page.split(tmp_path, finding.find(tmp_path))
     assert [(s.name, s.axes) for s in sweeps] == [("one", {"a": ["1", "2"]}), ("two", {})]
     assert "two" in sweep_page.write(tmp_path).read_text()
 
@@ -361,7 +362,7 @@ def test_several_sweeps_keep_apart(tmp_path):
 def test_job_ten_follows_job_nine(tmp_path):
     for number in (10, 9, 1):
         write_run(tmp_path / str(number), [f"a={number}"])
-    assert [run.folder.name for run in folders.find(tmp_path)] == ["1", "9", "10"]
+    assert [run.folder.name for run in finding.find(tmp_path)] == ["1", "9", "10"]
 
 
 def test_links_lead_to_folders_with_odd_names(tmp_path):

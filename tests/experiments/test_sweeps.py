@@ -213,7 +213,7 @@ def test_a_failed_job_stays_failed_until_it_is_retried(tmp_path):
     failed = next(
         path.parent
         for path in (tmp_path / "out").glob("a/*/status.json")
-        if reading.status(path.parent) == "failed"
+        if reading.read(path.parent).last_status == "failed"
     )
     record = json.loads((failed / "status.json").read_text())
     (failed / "status.json").write_text(json.dumps({**record, "reason": "the disk was full"}))
@@ -285,7 +285,7 @@ def running(folder):
     return {
         name: job["process"]
         for name, job in manifest.read(folder).items()
-        if job["state"] == "running" and reading.read(folder / name)["status"] == "running"
+        if job["state"] == "running" and reading.read(folder / name).status == "running"
     }
 
 
@@ -339,7 +339,7 @@ def test_a_preempted_job_is_requeued_and_resumes(undisturbed, tmp_path):
     victims = Victims(tmp_path, *arguments)
     try:
         runner = victims.start()
-        while not any(reading.steps(out / name) >= 3 for name in running(out)):
+        while not any(len(reading.read(out / name).steps) >= 3 for name in running(out)):
             assert runner.poll() is None, (tmp_path / "told.txt").read_text()
             time.sleep(0.02)
         ((name, process),) = running(out).items()

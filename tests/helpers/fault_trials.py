@@ -485,7 +485,7 @@ def _workers(folder: Path) -> list[int]:
     return [
         job["process"]
         for name, job in manifest.read(folder).items()
-        if job["state"] == "running" and reading.read(folder / name)["status"] == "running"
+        if job["state"] == "running" and reading.read(folder / name).status == "running"
     ]
 
 
@@ -758,7 +758,7 @@ def out_of_memory_in_a_worker(stage: Stage, chance: random.Random) -> str:
     (failed,) = (name for name, state in states.items() if state == "failed")
     for name in states.keys() - {failed}:
         check_same(folder / name, stage.swept / name)
-    reason = str(reading.read(folder / failed)["reason"])
+    reason = str(reading.read(folder / failed).reason)
     shutil.rmtree(folder)
     return reason
 

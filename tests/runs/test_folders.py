@@ -8,8 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from styleexp.experiments.sweeps import claim, manifest, report
-from styleexp.experiments.sweeps.jobs import Job, planned
-from styleexp.runs import folders, identity, reading
+from styleexp.runs import finding, identity, reading
+from styleexp.runs.jobs import Job, planned
 from styleexp.system import locks
 from tests.helpers import warm
 
@@ -236,8 +236,8 @@ def test_another_runs_folder_is_shown_as_what_it_is(exchanged):
     assert not [key for key in first if key.startswith("silhouette")]
     report.finish(exchanged)
     assert rows(exchanged)[0]["silhouette_iou"] == ""
-    seen = folders.find(exchanged)
-    assert [run.state for run in seen] == ["other", "done"]
+    seen = finding.find(exchanged)
+    assert [run.status for run in seen] == ["other", "done"]
     assert seen[0].summary == {}
 
 
@@ -270,8 +270,8 @@ def test_a_record_without_a_key_has_the_same_one(swept):
 def test_numbers_without_a_record_are_nobodys(exchanged):
     (exchanged / "0" / "run.json").unlink()
     found = reading.of_job(planned(exchanged)[0])
-    assert (found["status"], found["loss"]) == ("unreadable", None)
-    assert "no run.json" in found["reason"]
+    assert (found.status, found.loss) == ("unreadable", None)
+    assert "no run.json" in found.reason
 
 
 def test_a_plan_refuses_another_run_in_a_jobs_folder(swept, tmp_path):

@@ -14,7 +14,7 @@ from styleexp.cli.sweep import main as sweep_command
 from styleexp.config.compose import compose, recorded
 from styleexp.experiments.execute import resume
 from styleexp.inputs import meshes, shapes
-from styleexp.runs import folders, reading
+from styleexp.runs import reading
 from styleexp.runs.schema import SCHEMA
 from styleexp.system.errors import UserError
 
@@ -73,10 +73,10 @@ def test_pages_and_tables_read_them(commit, old, capsys, tmp_path):
     assert "bubble" in page
     assert "has layout" not in page
     assert report_command([str(tmp_path / "sweep")]) == 0
-    row = reading.read(at)
+    run = reading.read(at)
     steps = OLD[commit]["metrics.jsonl"]
-    assert (row["status"], row["loss"]) == ("done", pytest.approx(steps[-1]["loss"]))
-    assert row["config.field.sigma"] == OLD[commit]["run.json"]["config"]["field"]["sigma"]
+    assert (run.status, run.loss) == ("done", pytest.approx(steps[-1]["loss"]))
+    assert run.config["field.sigma"] == OLD[commit]["run.json"]["config"]["field"]["sigma"]
 
 
 def test_a_run_without_a_version_of_its_layout_is_of_the_first(old):
@@ -84,8 +84,8 @@ def test_a_run_without_a_version_of_its_layout_is_of_the_first(old):
     record = json.loads((at / "run.json").read_text())
     del record["schema"]
     (at / "run.json").write_text(json.dumps(record))
-    assert reading.read(at)["status"] == "done"
-    assert folders.read(at).problems == ()
+    assert reading.read(at).status == "done"
+    assert reading.read(at).problems == ()
 
 
 def test_one_is_measured_and_resumed_from_a_checkpoint_without_a_digest(old, capsys):
@@ -136,9 +136,9 @@ def test_a_sweep_shows_the_others_beside_one_of_a_later_version(old, capsys, tmp
     at = old(LATER, "sweep/1", schema=SCHEMA + 1)
     assert report_command([str(tmp_path / "sweep")]) == 0
     assert "reads layouts up to" in (tmp_path / "sweep" / "report.html").read_text()
-    row = reading.read(at)
-    assert row["status"] == "newer"
-    assert "reads layouts up to" in row["reason"]
+    run = reading.read(at)
+    assert run.status == "newer"
+    assert "reads layouts up to" in run.reason
 
 
 def test_a_plan_does_not_touch_a_job_of_a_later_version(old, capsys, tmp_path):

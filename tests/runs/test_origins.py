@@ -214,14 +214,15 @@ def test_a_figure_does_not_show_another_file_of_that_name(moved, tmp_path):
     from PIL import Image
 
     from styleexp.experiments.sweeps import figure
-    from styleexp.experiments.sweeps.jobs import Job
+    from styleexp.runs import reading
+    from styleexp.runs.jobs import Job
 
-    record = json.loads((moved / "run" / "run.json").read_text())
-    job = Job("0", tuple(record["overrides"]), moved / "run", record["key"])
-    config = figure._config(job, record)
-    assert isinstance(figure._picture("source", config, job, record, 32), Image.Image)
+    run = reading.read(moved / "run")
+    job = Job("0", tuple(run.overrides), run.folder, run.record["key"])
+    config = figure._config(job, run)
+    assert isinstance(figure._picture("source", config, run, 32), Image.Image)
     (moved / "t.ply").unlink()  # there is another t.ply in this folder
-    assert figure._picture("source", config, job, record, 32) == "not found"
+    assert figure._picture("source", config, run, 32) == "not found"
 
 
 # ------------------------------------------------------------------------------------ the record
@@ -242,7 +243,7 @@ def test_weights_are_in_the_record(tmp_path, monkeypatch):
     (tmp_path / "w").write_bytes(b"weights")
     monkeypatch.setattr(assets, "locate", lambda name, kind: tmp_path / "w")
     config = compose(["source=torus", "style=bubble", "encoder=vgg16", "metrics.judge=vgg16_edges"])
-    found = origins.noted(config)["weights"]
+    found = origins.noted(config, ["vgg16", "vgg16_edges", None])["weights"]
     assert set(found) == {"vgg16", "vgg16_edges"}
     assert found["vgg16"]["path"] == str(tmp_path / "w")
     assert found["vgg16"]["sha256"] == identity.sha256(tmp_path / "w")

@@ -121,13 +121,80 @@ def test_a_runs_record_is_values_alone(tmp_path):
             resume(tmp_path)
 
 
+INTERPOLATIONS = {
+    "a value": {"source": {"name": "${oc.env:HOME}"}},
+    "a key": {"source": {"${oc.env:HOME}": 1}},
+    "in a list": {"loss": {"layers": ["conv1_1", "${oc.env:HOME}"]}},
+    "a plugin's part": {"logger": {"x": {"note": "a ${oc.decode:1} b"}}},
+}
+
+
+@pytest.mark.parametrize("where", INTERPOLATIONS)
+def test_a_record_with_an_interpolation_is_refused_by_everything_that_reads_runs(where, tmp_path):
+    pytest.importorskip("pandas", reason="needs the extra report")
+    from dataclasses import asdict
+
+    from omegaconf import OmegaConf
+
+    from styleexp.experiments import agreement
+    from styleexp.experiments.execute import resume
+    from styleexp.experiments.metrics import board
+    from styleexp.experiments.reports import collect, page, shown
+    from styleexp.experiments.sweeps import figure, report
+    from styleexp.runs import finding, jobs, reading
+    from styleexp.runs.records import RunFolder, describe
+
+    config = compose.compose(["source=torus", "style=bubble", "preview.resolution=64"])
+    record = describe(config, [], ["styleexp"])
+    evil = OmegaConf.merge(asdict(config), INTERPOLATIONS[where])
+    record["config"] = OmegaConf.to_container(evil, resolve=False)
+    run = tmp_path / "0"
+    run.mkdir()
+    (run / "run.json").write_text(json.dumps(record))
+    (run / "status.json").write_text('{"status": "done"}')
+    (tmp_path / "jobs.json").write_text(
+        json.dumps({"jobs": [["source=torus", "style=bubble"]], "keys": [record["key"]]})
+    )
+
+    found = reading.read(run)
+    assert (found.record, found.config) == ({}, {})
+    assert any("holds an interpolation" in problem for problem in found.problems)
+    for use in (
+        resume,
+        lambda at: reading.recorded(at, "use"),
+        lambda at: board.measure_run(at, None),
+        lambda at: agreement.held_out_losses(at, []),
+    ):
+        with pytest.raises(UserError, match="holds an interpolation"):
+            use(run)
+    (run / "result.ply").touch()
+    with pytest.raises(UserError, match="can't be used"):
+        shown.read_moved(run)
+    assert RunFolder(run).unfinished(record) is None
+    (job,) = jobs.planned(tmp_path)
+    assert reading.of_job(job).status == "unreadable"
+    assert [each.status for each in finding.find(tmp_path)] == ["unreadable"]
+    (row,) = collect(tmp_path).to_dict("records")
+    assert row["status"] == "unreadable"
+    assert "holds an interpolation" in row["reason"]
+    assert not [column for column in row if column.startswith("config.")]
+    assert agreement.compare(tmp_path)[0]["status"] == "unreadable"
+    figure.write_figure([job], RunFolder(tmp_path))
+    report.finish(tmp_path)
+    text = page.rewrite(run).read_text(encoding="utf-8")
+    assert "holds an interpolation" in text
+    home = os.environ.get("HOME", "/root")
+    for path in (*tmp_path.glob("*.csv"), run / "report.html", run / "status.json"):
+        assert home not in path.read_text(encoding="utf-8").replace(str(tmp_path), "")
+
+
 def test_a_page_of_a_strangers_run_shows_no_file_that_the_run_did_not_use(tmp_path):
     """run.json may name any mesh of ours; without its sha256 it is not put on the page."""
     from dataclasses import asdict
 
     from styleexp.experiments.reports import shown
     from styleexp.inputs import meshes, shapes
-    from styleexp.runs import folders
+    from styleexp.runs import reading
 
     secret = tmp_path / "secret.ply"
     torus = shapes.make("torus", detail=300)
@@ -137,7 +204,7 @@ def test_a_page_of_a_strangers_run_shows_no_file_that_the_run_did_not_use(tmp_pa
     run.mkdir()
     (run / "run.json").write_text(json.dumps({"schema": 1, "config": config, "overrides": []}))
     (run / "status.json").write_text('{"status": "done"}')
-    found = shown.read(folders.read(run))
+    found = shown.read(reading.read(run))
     assert found.source is None
     assert any("source can't be shown" in told for told in found.missing)
 
@@ -146,7 +213,8 @@ def test_a_checkpoint_with_a_pickle_inside_is_damaged_not_run(tmp_path):
     import pickle
 
     from styleexp.config.build import prepare
-    from styleexp.runs.records import RunFolder, read_record
+    from styleexp.runs.reading import recorded
+    from styleexp.runs.records import RunFolder
 
     class Evil:
         def __reduce__(self):
@@ -172,7 +240,7 @@ def test_a_checkpoint_with_a_pickle_inside_is_damaged_not_run(tmp_path):
     assert state.step == 0
     assert not (tmp_path / "was-run").exists()
     with pytest.raises(UserError):
-        read_record(tmp_path)
+        recorded(tmp_path, "resume")
 
 
 def test_plugins_come_from_entry_points_or_the_variable_alone(tmp_path):

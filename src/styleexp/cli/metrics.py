@@ -101,9 +101,9 @@ def _judge(options: argparse.Namespace, trained: str | None = None) -> Judge | N
 
 def _run(options: argparse.Namespace) -> dict[str, Any]:
     from styleexp.experiments.metrics.board import measure_run
-    from styleexp.runs import records
+    from styleexp.runs import reading
 
-    trained = records.read_record(options.folder, "measure")["config"]["encoder"]["name"]
+    trained = reading.recorded(options.folder, "measure").config.get("encoder.name")
     return measure_run(options.folder, _judge(options, trained))
 
 

@@ -44,9 +44,9 @@ def report(given: list[str]) -> list[Path]:
             print(f"styleexp-report: {told}", file=sys.stderr)
         return pages
     from styleexp.experiments.reports import page, sweep_page
-    from styleexp.runs import folders
+    from styleexp.runs import finding
 
-    if folders.is_run(options.folder):
+    if finding.is_run(options.folder):
         written = page.rewrite(
             options.folder, lambda told: print(f"styleexp-report: note: {told}", file=sys.stderr)
         )

@@ -8,7 +8,7 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from styleexp.system.errors import UserError
 
@@ -43,7 +43,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Run or continue a plan of experiments: finished jobs are skipped, killed "
         "jobs are resumed. Any number of runners may share a folder.",
         epilog="styleexp-sweep status FOLDER shows every job; styleexp-sweep collect FOLDER writes "
-        "reading.csv and reading.parquet.",
+        "runs.csv and runs.parquet.",
     )
     parser.add_argument("plan", type=Path, metavar="PLAN", help="a plan file, see sweeps/")
     parser.add_argument(
@@ -113,7 +113,7 @@ def _report(read: Plan, by_entry: dict[str, list[Planned]], folder: Path) -> int
         title = f"{entry.name} ({entry.figure})" if entry.figure else entry.name
         (folder / entry.name).mkdir(exist_ok=True)
         report(by_entry[entry.name], folder / entry.name, title)
-    states = [reading.of_job(job)["status"] for jobs in by_entry.values() for job in jobs]
+    states = [reading.of_job(job).status for jobs in by_entry.values() for job in jobs]
     return 0 if set(states) == {"done"} else 2
 
 
@@ -133,7 +133,7 @@ def _show_commands(
         total += minutes or 0
         print(f"# {entry.name}{f', {entry.figure}' if entry.figure else ''}: {cost}")
         for job in by_entry[entry.name]:
-            status = reading.of_job(job)["status"]
+            status = reading.of_job(job).status
             note = "" if status == "missing" else f"  # {status}"
             note = "  # the same job as above" if job.name in seen else note
             seen.add(job.name)
@@ -146,8 +146,8 @@ def _status(folder: Path) -> int:
     from rich.table import Table
 
     from styleexp.experiments.sweeps import manifest
-    from styleexp.experiments.sweeps.jobs import Job
     from styleexp.runs import reading
+    from styleexp.runs.jobs import Job
 
     jobs = manifest.read(folder)
     if not jobs:
@@ -159,20 +159,19 @@ def _status(folder: Path) -> int:
     reasons: list[str] = []
     for name, known in jobs.items():
         job = Job(name, tuple(known.get("overrides", ())), folder / name, known.get("key"))
-        run: dict[str, Any] = reading.of_job(job)
-        if run["reason"]:
-            reasons.append(f"{name}: {run['reason']}")
-        state = "outdated" if known["state"] == "outdated" else str(run["status"])
+        run = reading.of_job(job)
+        if run.remark:
+            reasons.append(f"{name}: {run.remark}")
+        state = "outdated" if known["state"] == "outdated" else run.status
         state = "waiting" if state == "missing" else state
         counts[state] += 1
-        seconds, total = run["seconds"], run.get("config.optim.steps")
-        taken = reading.steps(folder / name)
+        taken, total = len(run.steps), run.config.get("optim.steps")
         table.add_row(
             name,
             state,
             f"{taken}/{total}" if taken and total else "",
             str(known.get("attempts", 0)),
-            f"{seconds:.0f} s" if isinstance(seconds, int | float) else "",
+            f"{run.seconds:.0f} s" if run.seconds is not None else "",
         )
     console = Console()
     if not console.is_terminal:

@@ -12,13 +12,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from styleexp.experiments.sweeps import report
-from styleexp.runs import reading
+from styleexp.runs import jobs, reading, results
 from styleexp.system import atomic
 from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
     import numpy as np
     from omegaconf import DictConfig
+
+    from styleexp.runs.jobs import Job
+    from styleexp.runs.reading import Run
+    from styleexp.runs.results import Stored
 
 DIFFERENCE_GAIN = 4
 """Contrast factor for drawing differences."""
@@ -43,58 +47,71 @@ def compare(folder: Path) -> list[dict[str, Any]]:
 
     ``distance`` is the RMS distance of the result's vertices from the first run's, relative to the
     first run's RMS displacement; ``correlation`` is the correlation of the two displacements;
-    ``picture`` is the mean absolute difference of four views, in [0, 1]. ``loss`` is the mean over
-    the last tenth of the steps, measured with the run's own renderer. ``held_out_loss`` is measured
-    with the first run's renderer and encoder for all runs: the loss at held-out views relative to
-    the source's; 1 means no style was gained.
+    ``picture`` is the mean absolute difference of four views, in [0, 1]. ``loss`` is `Run.loss`,
+    measured with the run's own renderer. ``held_out_loss`` is measured with the first run's
+    renderer and encoder for all runs: the loss at held-out views relative to the source's; 1 means
+    no style was gained.
     """
     import numpy as np
 
-    rows, results = [], []
-    for job in report.planned(folder):
-        found, run = reading.of_job(job), job.folder
-        named = [o.partition("=")[2] for o in job.overrides if o.startswith("renderer=")]
-        row = {
-            "run": str(run.relative_to(folder)),
-            "renderer": found.get("config.renderer.name", "".join(named[-1:])),
-            "status": found["status"],
-        }
+    rows, measured = [], []
+    for job in jobs.planned(folder):
+        run = reading.of_job(job)
+        row, result = _row(run, job, folder)
         rows.append(row)
-        if found["status"] != "done":
-            row["reason"] = found["reason"] or ""
-            continue
-        lines = (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
-        steps = [json.loads(line) for line in lines]
-        row["seconds_per_step"] = statistics.median(s["seconds"] for s in steps)
-        row["loss"] = statistics.fmean(s["loss"] for s in steps[-max(1, len(steps) // 10) :])
-        results.append((row, *_result(run / "result.ply")))
-    if not results:
+        if result is not None and result.displacement is not None:
+            measured.append((row, result, result.displacement, run))
+    if not measured:
         return rows
 
-    _, first, faces, displacement = results[0]
+    _, first, displacement, first_run = measured[0]
+    scale = max(float(np.sqrt((displacement**2).mean())), 1e-12)
     pictures = []
-    for row, vertices, _, other in results:
-        pictures.append((row, _views(first, vertices, faces)))
-        gap = np.linalg.norm(vertices - first, axis=1)
-        scale = max(float(np.sqrt((displacement**2).mean())), 1e-12)
+    for row, result, other, _ in measured:
+        pictures.append((row, _views(first.vertices, result.vertices, first.faces)))
+        gap = np.linalg.norm(result.vertices - first.vertices, axis=1)
         row["distance"] = float(np.sqrt((gap**2).mean())) / scale
         row["correlation"] = float(np.corrcoef(displacement, other)[0, 1])
         difference = np.abs(pictures[-1][1].astype(float) - pictures[0][1].astype(float))
         row["picture"] = float(difference.mean() / 255)
     _draw(pictures, folder / "figure.png")
     try:
-        distances = held_out_losses(folder / results[0][0]["run"], [v for _, v, *_ in results])
+        vertices = [result.vertices for _, result, *_ in measured]
+        losses = held_out_losses(first_run.folder, vertices)
     except UserError as error:  # a file of the first run has changed; report the rest
         print(f"note: held_out_loss is not measured: {error}")
-        distances = [None] * len(results)
-    for (row, *_), distance in zip(results, distances, strict=True):
-        row["held_out_loss"] = distance
+        losses = [None] * len(measured)
+    for (row, *_), loss in zip(measured, losses, strict=True):
+        row["held_out_loss"] = loss
     return rows
 
 
-def held_out_losses(run: Path, results: list[np.ndarray]) -> list[float] | list[None]:
+def _row(run: Run, job: Job, folder: Path) -> tuple[dict[str, Any], Stored | None]:
+    """A job's row as far as its own files tell, and its result, if it has one to compare."""
+    asked = [o.partition("=")[2] for o in job.overrides if o.startswith("renderer=")]
+    row = {
+        "run": str(run.folder.relative_to(folder)),
+        "renderer": run.config.get("renderer.name", "".join(asked[-1:])),
+        "status": run.status,
+    }
+    if run.status != "done":
+        return row | {"reason": run.remark or ""}, None
+    try:
+        result = results.read(run.folder / results.NAME)
+        if result.displacement is None:
+            raise UserError(f"'{run.folder / results.NAME}' has no displacement: run again.")
+    except UserError as error:
+        return row | {"status": "unreadable", "reason": str(error)}, None
+    if pace := [step["seconds"] for step in run.steps if "seconds" in step]:
+        row["seconds_per_step"] = statistics.median(pace)
+    if run.loss is not None:
+        row["loss"] = run.loss
+    return row, result
+
+
+def held_out_losses(folder: Path, moved: list[np.ndarray]) -> list[float] | list[None]:
     """Loss of each result (vertices, 3) at the style bank's views, relative to the source's loss,
-    with the settings and files of ``run``. Raises `UserError` if those have changed.
+    with the settings and files of the run in ``folder``. Raises `UserError` if those have changed.
 
     All entries are None if results were saved with more vertices than the source, split at seams.
     """
@@ -103,15 +120,16 @@ def held_out_losses(run: Path, results: list[np.ndarray]) -> list[float] | list[
     from styleexp.config import build
     from styleexp.method import targets
     from styleexp.method.scene import PaperScene
-    from styleexp.runs import origins, records
+    from styleexp.runs import origins
 
-    config = origins.restored(records.read_record(run, "compare"), run, "compare")
+    record = reading.recorded(folder, "compare").record
+    config = origins.restored(record, folder, "compare")
     config.optim.seed += HELD_OUT_SEED  # local views of one seed all come from one bank of cameras
     _, scene = build.prepare(config)
     assert isinstance(scene, PaperScene)
     subject, weights = scene.subject, config.loss
-    if any(len(vertices) != len(subject.source.vertices) for vertices in results):
-        return [None] * len(results)
+    if any(len(vertices) != len(subject.source.vertices) for vertices in moved):
+        return [None] * len(moved)
     target, loss = scene.target(targets.BANK_STEP), scene.loss
 
     def measure(vertices: torch.Tensor) -> float:
@@ -124,17 +142,8 @@ def held_out_losses(run: Path, results: list[np.ndarray]) -> list[float] | list[
     own = measure(subject.surface.vertices)
     return [
         measure(torch.from_numpy(subject.frame.apply(v)).to(subject.surface.vertices)) / own
-        for v in results
+        for v in moved
     ]
-
-
-def _result(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices, faces and displacement of a result, as stored in its file."""
-    from styleexp.inputs.meshes.ply import stored_result
-
-    vertices, faces, displacement = stored_result(path.read_bytes())
-    assert displacement is not None
-    return vertices, faces, displacement
 
 
 def _views(first: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -48,8 +48,8 @@ def job_key(config: Config) -> str:
 
 def of(record: Mapping[str, Any]) -> str | None:
     """Key of a recorded run; None for records of earlier versions that lack it."""
-    if isinstance(told := record.get("key"), str):
-        return told
+    if isinstance(key := record.get("key"), str):
+        return key
     try:
         files = {kind: record["assets"][kind]["sha256"] for kind in ("source", "style")}
         return _hash(record["config"], files, record["versions"]["styleexp"])
@@ -68,10 +68,10 @@ def not_of(key: str | None, overrides: Sequence[str], record: Mapping[str, Any])
     theirs = list(map(str, theirs)) if isinstance(theirs, list) else []
     if (of(record) == key) if key else (theirs == list(overrides)):
         return None
-    told = shlex.join(["styleexp", *theirs])
+    difference = shlex.join(["styleexp", *theirs])
     if theirs == list(overrides):
-        told = "the same overrides with other files or another version"
-    return f"the folder holds another run ({told})"
+        difference = "the same overrides with other files or another version"
+    return f"the folder holds another run ({difference})"
 
 
 def _hash(config: Mapping[str, Any], files: Mapping[str, str | None], version: str | None) -> str:

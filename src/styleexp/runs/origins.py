@@ -7,7 +7,7 @@ this module, from any working folder. A file is matched by its content, not by i
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,18 +39,13 @@ def describe(config: Config) -> dict[str, dict[str, str | None]]:
     return found
 
 
-def noted(config: Config) -> dict[str, Any]:
-    """``assets``, see `describe`, and the ``weights`` of encoder and judge, as far as available,
-    for the record of a run that is about to start."""
-    from styleexp.experiments import metrics
-
+def noted(config: Config, encoders: Iterable[str | None]) -> dict[str, Any]:
+    """``assets``, see `describe`, and the ``weights`` of these encoders, as far as available, for
+    the record of a run that is about to start."""
     record: dict[str, Any] = {"weights": {}}
     with suppress(UserError, OSError):  # the run itself reports it
         record["assets"] = describe(config)
-    names = {config.encoder.name}
-    with suppress(UserError):
-        names.add(metrics.judge_name(config.metrics.judge, config.encoder.name) or "")
-    for name in sorted(names & set(assets.names("weights"))):
+    for name in sorted(set(assets.names("weights")) & {each for each in encoders if each}):
         # Their content is checked against the published hash whenever they are read.
         if path := assets.locate(name, "weights"):
             record["weights"][name] = {
@@ -101,14 +96,14 @@ def find(
     Raises `UserError`, whose message lacks the subject, for a file that has changed or is missing.
     """
     part = sources.parts(config)[kind]
-    told = (record.get("assets") or {}).get(kind) or {}
-    digest = told.get("sha256")
+    used = (record.get("assets") or {}).get(kind) or {}
+    digest = used.get("sha256")
     if digest is None:
         path = sources.locate(kind, part.name, part.path)
         if path is None:
             return None
         raise UserError(f"its record has no sha256 of its {kind} '{path}': start the run again.")
-    named = Path(str(told.get("path") or part.path or part.name))
+    named = Path(str(used.get("path") or part.path or part.name))
     there = False
     for path in _candidates(named, kind, part, folder):
         if not path.is_file():

@@ -1,4 +1,4 @@
-"""A run's folder: status, record, metrics and checkpoints.
+"""Write a run's folder: status, record, metrics and checkpoints.
 
 Every file is written atomically, except ``metrics.jsonl``, which grows by one line per step.
 """
@@ -19,10 +19,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from styleexp import plugins
-from styleexp.runs import identity
-from styleexp.runs.schema import SCHEMA, too_new
+from styleexp.runs import identity, reading
+from styleexp.runs.schema import SCHEMA
 from styleexp.system import atomic, digests
-from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
     from styleexp.method.base import State, Step
@@ -91,20 +90,14 @@ class RunFolder:
         return atomic.write(self.path / name, writer)
 
     def unfinished(self, record: Mapping[str, Any]) -> dict[str, Any] | None:
-        """The record of this folder's run, if it is the same run as ``record`` and not done."""
-        path = self.path / "run.json"
-        try:
-            before = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+        """The record of this folder's run, if it is the same run as ``record`` and not done.
+
+        Raises `UserError` for a run of a later version, which must not be overwritten.
+        """
+        run = reading.readable(self.path, "run in")
+        if run.last_status in (None, "done") or identity.of(run.record) != record["key"]:
             return None
-        if told := too_new(before):  # must not be overwritten
-            raise UserError(f"cannot run in '{self.path}': {told}")
-        try:
-            status = json.loads((self.path / "status.json").read_text(encoding="utf-8"))
-            same = status["status"] != "done" and identity.of(before) == record["key"]
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
-            return None
-        return before if same else None
+        return run.record
 
     def begin(self, record: Mapping[str, Any] | None) -> None:
         """Mark the folder as running: a new run with this record, or (None) the previous one."""
@@ -279,21 +272,3 @@ def changed_versions(record: Mapping[str, Any]) -> str:
 def now() -> str:
     """Current time, UTC, ISO 8601."""
     return datetime.now(UTC).isoformat(timespec="seconds")
-
-
-def read_record(folder: Path, purpose: str = "resume") -> dict[str, Any]:
-    """Read a folder's ``run.json``. Raises `UserError` if it is missing or unreadable."""
-    path = folder / "run.json"
-    if not path.is_file():
-        raise UserError(
-            f"cannot {purpose} '{folder}': it has no run.json, so it is not a run's folder."
-        )
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-        if told := too_new(record):
-            raise UserError(f"cannot {purpose} '{folder}': {told}")
-        if not isinstance(record, dict):
-            raise ValueError("it is not a JSON object")
-    except ValueError as error:
-        raise UserError(f"'{path}' cannot be read ({error}): start the run again.") from error
-    return record

@@ -8,14 +8,11 @@ from __future__ import annotations
 
 import importlib.util
 import warnings
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from styleexp.experiments.bench.task import Contender, Rendered, Task
 from styleexp.system.errors import UserError
-
-if TYPE_CHECKING:
-    from styleexp.experiments.bench.render import Contender, Task
 
 INSTALL = {
     "deodr": "pip install 'styleexp[bench]'",
@@ -35,8 +32,6 @@ def deodr(task: Task) -> Contender:
     with warnings.catch_warnings(action="ignore"):  # about its own docstrings
         from deodr.differentiable_renderer import Camera, Scene3D
         from deodr.triangulated_mesh import ColoredTriMesh
-
-    from styleexp.experiments.bench.render import Rendered
 
     cameras, size = task.cameras, task.resolution
     vertices = task.vertices.double().numpy()

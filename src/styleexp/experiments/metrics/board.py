@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +15,7 @@ from styleexp.inputs import meshes
 from styleexp.inputs.style import Style
 from styleexp.method.patches import relief_of_result
 from styleexp.method.subject import pattern_unit
-from styleexp.runs import origins, records
+from styleexp.runs import finding, origins, reading, records, results
 from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
@@ -48,7 +47,7 @@ def measure_board(folder: Path, judge: Judge, write: bool = False) -> dict[str, 
     results: list[tuple[dict[str, Any], Looks]] = []
     goals: dict[str, Looks] = {}
     contents: dict[str, str] = {}
-    runs = sorted((path.parent for path in folder.rglob("run.json")), key=lambda p: str(p))
+    runs = sorted((at for at in finding.folders(folder) if (at / "run.json").is_file()), key=str)
     if not runs:
         raise UserError(f"'{folder}' contains no run: give a run's or a sweep's folder.")
     for run in runs:
@@ -122,16 +121,13 @@ def _finished(
     folder: Path,
 ) -> tuple[dict[str, Any], Config, meshes.Mesh, Style, np.ndarray, np.ndarray]:
     """Record, configuration, source, style and result of a finished run."""
-    record = records.read_record(folder, "measure")
-    try:
-        status = json.loads((folder / "status.json").read_text(encoding="utf-8"))["status"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"'{folder}/status.json' cannot be read ({error}).") from error
-    if status != "done":
+    run = reading.recorded(folder, "measure")
+    if run.status != "done":
+        status = run.last_status or run.status
         raise UserError(f"the run in '{folder}' is {status}, not done: there is no result yet.")
-    config = origins.restored(record, folder, "measure")
+    config = origins.restored(run.record, folder, "measure")
     source, style = load_source(config.source), load_style(config.style)
-    return record, config, source, style, *read_result(folder / "result.ply", source)
+    return run.record, config, source, style, *read_result(folder / results.NAME, source)
 
 
 def read_result(path: Path, source: meshes.Mesh) -> tuple[np.ndarray, np.ndarray]:
@@ -157,9 +153,7 @@ def read_result(path: Path, source: meshes.Mesh) -> tuple[np.ndarray, np.ndarray
 def _rows(path: Path) -> np.ndarray:
     """Vertices in file order."""
     if path.suffix.lower() == ".ply":
-        from styleexp.inputs.meshes.ply import numbers, parse
-
-        return numbers(parse(path.read_bytes()).elements["vertex"], *"xyz")
+        return results.positions(path)
     import trimesh
 
     loaded = trimesh.load(path, process=False, force="mesh")

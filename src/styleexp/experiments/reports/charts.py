@@ -69,8 +69,8 @@ def dot_chart(
     for k, (_, dots) in enumerate(kept):
         for run, y in dots:
             place = f'cx="{right(k):.1f}" cy="{up(y):.1f}" r="4"'
-            told = f"{run}: {y:.4g}"
-            parts.append(f'<circle class="dot" {place}><title>{escape(told)}</title></circle>')
+            label = f"{run}: {y:.4g}"
+            parts.append(f'<circle class="dot" {place}><title>{escape(label)}</title></circle>')
     return _chart(title, parts, [])
 
 

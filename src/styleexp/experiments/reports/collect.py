@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from styleexp.runs import folders, reading
+from styleexp.runs import finding
 from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
     import pandas
+
+    from styleexp.runs.reading import Run
 
 FIRST = ("run", "status", "seconds", "reason", "device", "loss")
 """Leading columns."""
@@ -22,7 +22,7 @@ def collect(folder: str | Path) -> pandas.DataFrame:
     """One row per run below ``folder``, including those that failed or never started.
 
     Columns: ``run`` (its folder, relative), ``status``, ``seconds``, ``reason``, ``device``,
-    ``loss`` (mean of the last tenth of the steps), ``config.*``, ``metric.*``, ``version.*``,
+    ``loss`` (`reading.final_loss`), ``config.*``, ``metric.*``, ``version.*``,
     ``asset.*`` (sha256), ``experiment`` if known from a plan. ``status`` is the run's own, or
     ``missing`` (planned but never started), ``died`` (its process was killed), ``outdated`` (its
     plan has changed since), or ``other`` (the job's folder contains another run). List values are
@@ -35,19 +35,19 @@ def collect(folder: str | Path) -> pandas.DataFrame:
         import pandas
     except ImportError:
         raise UserError("collecting needs pandas: pip install 'styleexp[report]'.") from None
-    asked = {job.folder: job for job in folders.planned(folder)}
-    rows = []
-    for run, more in sorted(_runs(folder, asked).items()):
-        job = asked.get(folder / run)
-        row = reading.read(folder / run) if job is None else reading.of_job(job)
-        rows.append({"run": run, **row, **more})
+    listed = _listed(folder)
+    runs = {str(run.folder.relative_to(folder)): run for run in finding.find(folder)}
+    rows = [
+        {"run": path, **row(run), **listed.get(run.folder, {})}
+        for path, run in sorted(runs.items())
+    ]
     frame = pandas.DataFrame(rows, columns=None if rows else list(FIRST))
     rest = sorted(column for column in frame.columns if column not in FIRST)
     return frame.reindex(columns=[*FIRST, *rest])
 
 
 def write(frame: pandas.DataFrame, folder: str | Path) -> list[Path]:
-    """Write ``reading.csv`` and ``reading.parquet``; return their paths.
+    """Write ``runs.csv`` and ``runs.parquet``; return their paths.
 
     Parquet columns have a single type: columns of mixed types are written as text.
     """
@@ -60,43 +60,40 @@ def write(frame: pandas.DataFrame, folder: str | Path) -> list[Path]:
         if len(kinds - {int, float}) > (0 if kinds & {int, float} else 1):
             typed[name] = typed[name].map(str, na_action="ignore")
     try:
-        parquet = target.write("reading.parquet", lambda path: typed.to_parquet(path, index=False))
+        parquet = target.write("runs.parquet", lambda path: typed.to_parquet(path, index=False))
     except ImportError:
         raise UserError("Parquet needs pyarrow: pip install 'styleexp[report]'.") from None
-    return [target.write("reading.csv", lambda path: frame.to_csv(path, index=False)), parquet]
+    return [target.write("runs.csv", lambda path: frame.to_csv(path, index=False)), parquet]
 
 
-def _runs(folder: Path, asked: Iterable[Path]) -> dict[str, dict[str, str]]:
-    """The existing and planned runs below a folder, with what plans and sweeps say about them."""
+def row(run: Run) -> dict[str, Any]:
+    """A run as a flat row, with the columns of `collect`."""
+    flat: dict[str, Any] = {
+        "status": run.status,
+        "seconds": run.seconds,
+        "reason": run.remark,
+        "device": run.device,
+        "loss": run.loss,
+    }
+    flat |= {f"metric.{name}": value for name, value in run.measured.items()}
+    for key, value in run.config.items():
+        flat[f"config.{key}"] = json.dumps(value) if isinstance(value, list) else value
+    for name, version in (run.record.get("versions") or {}).items():
+        flat[f"version.{name}"] = version
+    for role, asset in (run.record.get("assets") or {}).items():
+        flat[f"asset.{role}"] = asset.get("sha256") or asset.get("name")
+    return flat
+
+
+def _listed(folder: Path) -> dict[Path, dict[str, str]]:
+    """What the plans below a folder say about their jobs, by the jobs' folders."""
     from styleexp.experiments.sweeps import manifest
 
-    found: dict[str, dict[str, str]] = {run: {} for run in _begun(folder)}
-    for path in asked:
-        found.setdefault(str(path.relative_to(folder)), {})
+    found: dict[Path, dict[str, str]] = {}
     for path in sorted(folder.rglob(manifest.NAME)):
-        jobs, below = manifest.read(path.parent), path.parent.relative_to(folder)
-        for name, listed in jobs.items():
-            run, outdated = str(below / name), listed["state"] == "outdated"
-            if outdated and run not in found:
-                continue
-            known = found.setdefault(run, {})
-            known["experiment"] = listed.get("experiment", "")
-            if outdated:
-                known["status"] = "outdated"
+        for name, job in manifest.read(path.parent).items():
+            columns = found.setdefault(path.parent / name, {})
+            columns["experiment"] = job.get("experiment", "")
+            if job["state"] == "outdated":
+                columns["status"] = "outdated"
     return found
-
-
-def _begun(folder: Path) -> Iterator[str]:
-    """Yield folders with a run's record or status; runs aren't nested."""
-    for at, below, files in os.walk(folder):
-        if "status.json" in files or ("run.json" in files and _is_record(Path(at) / "run.json")):
-            below.clear()
-            yield str(Path(at).relative_to(folder))
-        below[:] = sorted(name for name in below if not name.startswith("."))
-
-
-def _is_record(path: Path) -> bool:
-    try:
-        return "config" in json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False

@@ -15,8 +15,7 @@ import numpy as np
 
 from styleexp.experiments.reports import html, page, sweep_page
 from styleexp.experiments.reports.collect import collect
-from styleexp.experiments.reports.shown import read_result
-from styleexp.runs import folders
+from styleexp.runs import finding, results
 from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
@@ -24,6 +23,8 @@ if TYPE_CHECKING:
     from IPython.display import HTML
     from IPython.display import Image as Shown
     from matplotlib.figure import Figure
+
+    from styleexp.runs.reading import Run
 
 VERDICTS = {True: "yes", False: "no", None: "can't be told"}
 RANDOM = "vgg19_random"
@@ -37,19 +38,19 @@ def runs(folder: str | Path, *experiments: str) -> pandas.DataFrame:
     the overrides that not all runs share. Raises `UserError` if there is no such run.
     """
     folder = Path(folder)
-    found = {run.folder: run for run in folders.find(folder)}
+    found = {run.folder: run for run in finding.find(folder)}
     kept = {
         path: run for path, run in found.items() if not experiments or belongs(run, experiments)
     }
     if not kept:
-        told = " or ".join(experiments) or "any experiment"
-        raise UserError(f"there is no run of {told} below '{folder}'.")
+        wanted = " or ".join(experiments) or "any experiment"
+        raise UserError(f"there is no run of {wanted} below '{folder}'.")
     axes = sweep_page.axes(list(kept.values()))
     frame = collect(folder)
     frame["path"] = [folder / run for run in frame["run"]]
     frame = frame.set_index("path", drop=False).reindex(list(kept))
     frame["path"] = list(kept)
-    frame["status"] = [run.state for run in kept.values()]
+    frame["status"] = [run.status for run in kept.values()]
     frame["pair"] = [f"{run.part('source')}-{run.part('style')}" for run in kept.values()]
     given = [sweep_page.settings(run) for run in kept.values()]
     frame["seed"] = [each.get(sweep_page.SEED, "0") for each in given]
@@ -58,7 +59,7 @@ def runs(folder: str | Path, *experiments: str) -> pandas.DataFrame:
     return frame.reset_index(drop=True).dropna(axis=1, how="all")
 
 
-def belongs(run: folders.Run, experiments: Sequence[str]) -> bool:
+def belongs(run: Run, experiments: Sequence[str]) -> bool:
     """Whether a run belongs to one of the experiments, by its overrides or its folder."""
     named = sweep_page.settings(run).get("experiment")
     return named in experiments or any(part in experiments for part in run.folder.parts)
@@ -66,23 +67,23 @@ def belongs(run: folders.Run, experiments: Sequence[str]) -> bool:
 
 def caution(frame: pandas.DataFrame) -> str:
     """Caveats about these runs, as Markdown; may be empty."""
-    told = []
+    notes = []
     not_done = frame[frame["status"] != "done"]
     if len(not_done):
         counts = ", ".join(f"{n} {state}" for state, n in not_done["status"].value_counts().items())
-        told.append(f"{len(not_done)} of {len(frame)} runs are not finished: {counts}.")
+        notes.append(f"{len(not_done)} of {len(frame)} runs are not finished: {counts}.")
     learned = frame
     if "config.baseline.name" in frame:
         learned = frame[frame["config.baseline.name"].isna()]
     encoders = learned.get("config.encoder.name")
     if encoders is not None and (encoders == RANDOM).any():
-        told.append("The encoder has random weights: nothing here says anything about style.")
+        notes.append("The encoder has random weights: nothing here says anything about style.")
     steps = learned.get("config.optim.steps")
     if steps is not None and steps.dropna().max() < 100:
-        told.append(f"The runs have {steps.dropna().max():g} steps, the paper's 1000.")
+        notes.append(f"The runs have {steps.dropna().max():g} steps, the paper's 1000.")
     if "seed" in frame and frame["seed"].nunique() == 1:
-        told.append("There is only one seed: differences may be due to chance.")
-    return "\n".join(f"- **{each}**" for each in told)
+        notes.append("There is only one seed: differences may be due to chance.")
+    return "\n".join(f"- **{each}**" for each in notes)
 
 
 def pictures(frame: pandas.DataFrame, columns: str, rows: str = "pair") -> Shown:
@@ -204,15 +205,15 @@ def slope(path: str | Path) -> float:
     height, how fine the relief is. NaN without a result."""
     from styleexp.experiments.reports.glb import edges
 
-    file = Path(path) / "result.ply"
+    file = Path(path) / results.NAME
     if not file.is_file():
         return math.nan
-    vertices, faces, displacement = read_result(file)
-    if displacement is None:
+    result = results.read(file)
+    if result.displacement is None:
         return math.nan
-    a, b = edges(faces).T
-    length = np.linalg.norm(vertices[a] - vertices[b], axis=1)
-    steep = np.abs(displacement[a] - displacement[b])[length > 0] / length[length > 0]
+    a, b = edges(result.faces).T
+    length = np.linalg.norm(result.vertices[a] - result.vertices[b], axis=1)
+    steep = np.abs(result.displacement[a] - result.displacement[b])[length > 0] / length[length > 0]
     return float(np.sqrt(np.square(steep).mean()))
 
 
@@ -248,9 +249,9 @@ def claims(*each: Claim) -> HTML:
 
 def table(frame: pandas.DataFrame, metrics: Sequence[str] = ()) -> pandas.DataFrame:
     """The runs' axes and numbers for display: those of ``metrics`` that exist, or all."""
-    # Redundant with ``pair``; and the experiment that started a run shared by several.
-    told = ("axis.pair", "axis.source", "axis.style", "axis.experiment")
-    axes = [c for c in frame if str(c).startswith("axis.") and c not in told]
+    # Implied by ``pair``; and the experiment that started a run shared by several.
+    redundant = ("axis.pair", "axis.source", "axis.style", "axis.experiment")
+    axes = [c for c in frame if str(c).startswith("axis.") and c not in redundant]
     measured = [f"metric.{m}" for m in metrics] or [c for c in frame if c.startswith("metric.")]
     wanted = ["pair", *axes, "seed", "status", "seconds", "loss", *measured]
     shown = frame[[column for column in wanted if column in frame]]

@@ -12,7 +12,7 @@ from typing import Any
 
 from styleexp.experiments.reports import html
 from styleexp.experiments.reports.notebook import belongs
-from styleexp.runs import folders
+from styleexp.runs import finding
 from styleexp.system.errors import UserError
 
 NOTEBOOKS: dict[str, tuple[str, ...]] = {
@@ -48,7 +48,7 @@ def execute(folder: Path, names: Sequence[str] = ()) -> tuple[list[Path], list[s
     for name in names:
         if name not in NOTEBOOKS:
             raise unknown_name("notebook", name, NOTEBOOKS)
-    runs = folders.find(folder)
+    runs = finding.find(folder)
     if not runs:
         raise UserError(f"there is no run below '{folder}': give the folder of a sweep or a plan.")
     target = folder / "notebooks"
@@ -56,8 +56,8 @@ def execute(folder: Path, names: Sequence[str] = ()) -> tuple[list[Path], list[s
     for name in names or NOTEBOOKS:
         experiments = NOTEBOOKS[name]
         if experiments and not any(belongs(run, experiments) for run in runs):
-            told = " or ".join(experiments)
-            left_out.append(f"{name} was left out: there is no run of {told} below '{folder}'.")
+            wanted = " or ".join(experiments)
+            left_out.append(f"{name} was left out: there is no run of {wanted} below '{folder}'.")
             continue
         target.mkdir(exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="styleexp-notebook-") as work:

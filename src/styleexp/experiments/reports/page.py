@@ -12,12 +12,12 @@ import numpy as np
 
 from styleexp.experiments.reports import charts, glb, html
 from styleexp.experiments.reports import shown as shows
-from styleexp.runs import folders
+from styleexp.runs import reading
 
 if TYPE_CHECKING:
     from styleexp.experiments.reports.shown import Shown
     from styleexp.method.base import Result
-    from styleexp.runs.folders import Run
+    from styleexp.runs.reading import Run
 
 NAME = "report.html"
 STYLE_PIXELS = 720
@@ -57,19 +57,19 @@ def write(run: Run, shown: Shown) -> Path:
 
 def write_ended(folder: Path, result: Result, seconds: float) -> Path:
     """Write the page of a run that has finished its last step but not yet updated its status."""
-    run = folders.read(folder)
-    status = {"status": "done", "seconds": round(seconds, 1)}
-    return write(dataclasses.replace(run, status=status), shows.of(result))
+    run = reading.read(folder)
+    ended = dataclasses.replace(run, status="done", reason=None, seconds=round(seconds, 1))
+    return write(ended, shows.of(result))
 
 
 def rewrite(folder: Path, tell: Callable[[str], Any] | None = None) -> Path:
     """Write the page of a run, finished or not, from its folder; ``tell`` is called with a sentence
     for everything that couldn't be shown."""
-    run = folders.readable(folder, "show")
+    run = reading.readable(folder, "show")
     shown = shows.read(run)
     if tell is not None:
-        for told in shown.missing:
-            tell(told)
+        for note in shown.missing:
+            tell(note)
     return write(run, shown)
 
 
@@ -92,7 +92,7 @@ def build(run: Run, shown: Shown) -> str:
         style_picture=style_picture,
         heat=_heat(shown),
         curves=curves(run),
-        warnings=[*run.record.get("notes", ()), *run.problems, *shown.missing],
+        warnings=[*(run.record.get("notes") or ()), *run.problems, *shown.missing],
         assets=_assets(run),
         still=html.picture(run.folder / "preview.png", STILL_PIXELS),
         meanings=MEANINGS,
@@ -104,7 +104,7 @@ def build(run: Run, shown: Shown) -> str:
 
 def facts(run: Run, shown: Shown) -> list[tuple[str, str]]:
     """The key numbers of a run."""
-    found = [("status", run.state)]
+    found = [("status", run.status)]
     if asked := [each for each in run.overrides if not each.lstrip("+~").startswith("hydra.")]:
         found.append(("asked for", " ".join(asked)))
     if run.config:
@@ -117,9 +117,9 @@ def facts(run: Run, shown: Shown) -> list[tuple[str, str]]:
         if "loss" in run.summary:
             first = next(step["loss"] for step in run.steps if "loss" in step)
             found.append(("loss", f"{first:.3g} → {run.summary['loss']:.3g}"))
-    if run.record.get("device"):
+    if run.device:
         precision = run.record.get("encoder_precision")
-        found.append(("device", run.record["device"] + (f", {precision}" if precision else "")))
+        found.append(("device", run.device + (f", {precision}" if precision else "")))
     if shown.result is not None:
         rows, faces = len(shown.result.vertices), len(shown.result.faces)
         found.append(("mesh", f"{rows} vertices, {faces} faces"))

@@ -11,6 +11,7 @@ import numpy as np
 
 from styleexp.experiments.reports import glb
 from styleexp.inputs import meshes
+from styleexp.runs import reading, results
 from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
     from styleexp.inputs.style import Style
     from styleexp.method.base import Result
-    from styleexp.runs.folders import Run
+    from styleexp.runs.reading import Run
 
 WITHIN = 99.5
 """Percentile of |displacement| at which the heat map saturates, so that a few spikes don't use up
@@ -98,25 +99,19 @@ def read(run: Run) -> Shown:
         found["source"] = Shape(frame.apply(source.vertices), source.faces)
     if style is not None:
         found["style"] = _style(style)
-    path = run.folder / "result.ply"
+    path = run.folder / results.NAME
     if path.is_file():
         try:
-            vertices, faces, displacement = read_result(path)
-            frame = frame or meshes.normalisation(vertices)
-        except Exception as error:  # whatever a damaged file raises
-            missing.append(f"The result can't be shown: result.ply cannot be read ({error}).")
+            result = results.read(path)
+        except UserError as error:
+            missing.append(f"The result can't be shown: {error}")
         else:
-            found |= {"result": Shape(frame.apply(vertices), faces), "displacement": displacement}
+            frame = frame or meshes.normalisation(result.vertices)
+            found["result"] = Shape(frame.apply(result.vertices), result.faces)
+            found["displacement"] = result.displacement
     else:
         missing.append("There is no result: the folder has no result.ply.")
     return Shown(**found, radius=frame.scale if frame else 1.0, missing=tuple(missing))
-
-
-def read_result(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Vertices (n, 3), faces (m, 3) and displacement (n,) of a ``result.ply``, in file order."""
-    from styleexp.inputs.meshes.ply import stored_result
-
-    return stored_result(path.read_bytes())
 
 
 def read_moved(folder: Path) -> tuple[meshes.Mesh, np.ndarray, np.ndarray]:
@@ -125,32 +120,32 @@ def read_moved(folder: Path) -> tuple[meshes.Mesh, np.ndarray, np.ndarray]:
     Raises `UserError` if they are unavailable.
     """
     from styleexp.inputs.meshes.writing import ply_rows
-    from styleexp.runs import folders
 
-    run, missing = folders.readable(folder, "use"), list[str]()
-    path = folder / "result.ply"
+    run, missing = reading.readable(folder, "use"), list[str]()
+    path = folder / results.NAME
     if not path.is_file():
         raise UserError(f"'{folder}' has no result.ply: give the folder of a finished run.")
     source, _ = _load(run, missing)
     if source is None:
         raise UserError(f"'{folder}' can't be used: {missing[0]}")
-    try:
-        stored, faces, values = read_result(path)
-    except Exception as error:  # whatever a damaged file raises
-        raise UserError(f"'{path}' cannot be read ({error}): run again.") from None
+    stored = results.read(path)
     rows, corners = np.arange(len(source.vertices)), source.faces
     if source.carrier is not None:
         first, combined = ply_rows(source.carrier)
         rows, corners = source.carrier.rows[first], combined[source.carrier.corners]
     # The same number of vertices in another order, as written by another version, is another mesh.
-    if values is None or len(stored) != len(rows) or not np.array_equal(faces, corners):
+    if (
+        stored.displacement is None
+        or len(stored.vertices) != len(rows)
+        or not np.array_equal(stored.faces, corners)
+    ):
         raise UserError(
             f"'{path}' has other vertices than its source '{source.name}' (as baseline="
             "geometric_textures makes them, which resamples it), so its displacement is not of "
             "the source."
         )
     moved, displacement = np.zeros_like(source.vertices), np.zeros(len(source.vertices))
-    moved[rows], displacement[rows] = stored, values
+    moved[rows], displacement[rows] = stored.vertices, stored.displacement
     return source, moved, displacement
 
 

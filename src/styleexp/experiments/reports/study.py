@@ -15,8 +15,8 @@ import numpy as np
 from styleexp.experiments.reports import html
 from styleexp.experiments.reports import shown as shows
 from styleexp.experiments.reports.page import STYLE_PIXELS
-from styleexp.runs import folders
-from styleexp.runs.folders import Run
+from styleexp.runs import finding
+from styleexp.runs.reading import Run
 from styleexp.system.errors import UserError
 
 NAME = "study.html"
@@ -33,7 +33,7 @@ def write(folder: Path, seed: int = 0, title: str = "Rating of stylised meshes")
     ``seed`` affects the order in which each participant sees the pairs. Raises `UserError` if there
     is no pair, or if one of them can't be shown completely, since participants couldn't judge it.
     """
-    runs = [run for run in folders.find(folder) if run.state == "done"]
+    runs = [run for run in finding.find(folder) if run.status == "done"]
     if not runs:
         raise UserError(f"there is no finished run below '{folder}' to be rated.")
     blocks: dict[str, str] = {}

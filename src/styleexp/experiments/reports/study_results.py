@@ -70,8 +70,8 @@ def read(paths: Sequence[Path]) -> Study:
         try:
             answers.append(_read(path))
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            told = f"it has no {error}" if isinstance(error, KeyError) else str(error)
-            left_out.append(f"'{path}' was left out: it holds no answers of a study ({told}).")
+            reason = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+            left_out.append(f"'{path}' was left out: it holds no answers of a study ({reason}).")
     if not answers:
         raise UserError(" ".join(["no file with answers could be read.", *left_out]))
     study = statistics.mode(answer.study for answer in answers)

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from styleexp.experiments.reports import charts, html, page
-from styleexp.runs import folders
-from styleexp.runs.folders import Run
+from styleexp.runs import finding
+from styleexp.runs.reading import Run
 from styleexp.system.errors import UserError
 
 NAME = "report.html"
@@ -62,9 +62,9 @@ class Sweep:
 
     def label(self, run: Run) -> str:
         """Label that distinguishes a run from the others."""
-        told = [f"{k}={v}" for k, v in zip(self.axes, self.values(run), strict=True)]
+        values = [f"{k}={v}" for k, v in zip(self.axes, self.values(run), strict=True)]
         seed = self.seed_of(run)
-        return ", ".join([*told, *([f"seed {seed}"] if seed else [])]) or run.folder.name
+        return ", ".join([*values, *([f"seed {seed}"] if seed else [])]) or run.folder.name
 
     @property
     def row_axis(self) -> str:
@@ -104,12 +104,12 @@ def write(folder: Path, run_pages: bool = True) -> Path:
     Also writes missing pages of finished runs, unless ``run_pages`` is false. Raises `UserError` if
     there is no run.
     """
-    runs = folders.find(folder)
+    runs = finding.find(folder)
     if not runs:
         raise UserError(f"there is no run below '{folder}': give the folder of a run or a sweep.")
     if run_pages:
         for run in runs:
-            if run.state == "done" and not (run.folder / page.NAME).is_file():
+            if run.status == "done" and not (run.folder / page.NAME).is_file():
                 page.rewrite(run.folder)
     return html.save(folder / NAME, build(folder, runs))
 
@@ -171,7 +171,7 @@ def headline(run: Run) -> tuple[str, float] | None:
 
 def measures(sweep: Sweep) -> list[str]:
     """Names of all numbers that any run of the sweep has."""
-    first = [told[0] for run in sweep.runs if (told := headline(run))]
+    first = [shown[0] for run in sweep.runs if (shown := headline(run))]
     return list(dict.fromkeys([*first, *(name for run in sweep.runs for name in run.summary)]))
 
 
@@ -198,7 +198,7 @@ def plots(sweep: Sweep) -> list[dict[str, Any]]:
 
 
 def _picture(run: Run) -> str | None:
-    seen = html.views(run.folder, 2) if run.state == "done" else []
+    seen = html.views(run.folder, 2) if run.status == "done" else []
     return html.data_uri(seen[0], html.THUMBNAIL) if seen else None
 
 
@@ -212,7 +212,7 @@ def _link(run: Run, folder: Path) -> str | None:
 
 
 def _count(runs: list[Run]) -> dict[str, int]:
-    states = [run.state for run in runs]
+    states = [run.status for run in runs]
     return {state: states.count(state) for state in dict.fromkeys(states)}
 
 

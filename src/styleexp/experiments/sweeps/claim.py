@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 from styleexp.config import unread
 from styleexp.config.overrides import quote
-from styleexp.experiments.sweeps.jobs import JOBS, Job, listed, product
+from styleexp.experiments.sweeps.settings import product
 from styleexp.runs import reading
+from styleexp.runs.jobs import JOBS, Job, listed
 from styleexp.runs.records import RunFolder
 from styleexp.system import locks
 from styleexp.system.errors import UserError
@@ -56,8 +57,8 @@ def sweep(config: DictConfig) -> Path:
         locks.drop(folder)
         raise
     RunFolder(folder).write_json(JOBS, content)
-    if told := unread.note(configs, _given(config)):
-        print(f"note: {told}", flush=True)
+    if note := unread.note(configs, _given(config)):
+        print(f"note: {note}", flush=True)
     return folder
 
 
@@ -165,17 +166,15 @@ def _search(config: DictConfig) -> dict[str, Any]:
 def _refuse_others(folder: Path, jobs: Sequence[Job], content: dict[str, Any]) -> None:
     """Raise `UserError` if a folder contains results of other jobs. Failed jobs may be
     overwritten."""
-    told = "choose another folder with hydra.sweep.dir=FOLDER, or remove it."
+    remedy = "choose another folder with hydra.sweep.dir=FOLDER, or remove it."
     before = listed(folder)
     if before is not None:
         asked = "jobs" if "jobs" in content else "search"
         if before.get(asked) != json.loads(json.dumps(content[asked])):
-            raise UserError(f"'{folder}' contains another sweep: {told}")
+            raise UserError(f"'{folder}' contains another sweep: {remedy}")
     for job in jobs:
-        found = reading.of_job(job)
-        if found["status"] == "newer":
-            raise UserError(f"cannot run in '{job.folder}': {found['reason']}")
-        if found["status"] == "other" and reading.status(job.folder) != "failed":
-            raise UserError(
-                f"'{job.folder}' doesn't belong to this sweep ({found['reason']}): {told}"
-            )
+        run = reading.of_job(job)
+        if run.status == "newer":
+            raise UserError(f"cannot run in '{job.folder}': {run.reason}")
+        if run.status == "other" and run.last_status != "failed":
+            raise UserError(f"'{job.folder}' doesn't belong to this sweep ({run.reason}): {remedy}")

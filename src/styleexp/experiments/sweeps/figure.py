@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from styleexp.experiments.sweeps.jobs import Job, setting, varying
+from styleexp.experiments.sweeps.settings import setting, varying
 from styleexp.runs import reading
+from styleexp.runs.jobs import Job
+from styleexp.runs.reading import Run
 from styleexp.runs.records import RunFolder
 
 if TYPE_CHECKING:
@@ -116,12 +117,12 @@ def _results(shown: Sequence[Shown], jobs: Sequence[int]) -> list[Cell]:
 def write_figure(jobs: Sequence[Job], folder: RunFolder) -> None:
     """Draw ``figure.png`` of the first `MOST` jobs; a job without a result shows its status
     instead."""
-    told = varying([job.overrides for job in jobs])
-    records = [_record(job) for job in jobs[:MOST]]
-    configs = [_config(job, record) for job, record in zip(jobs[:MOST], records, strict=True)]
+    settings = varying([job.overrides for job in jobs])
+    runs = [reading.of_job(job) for job in jobs[:MOST]]
+    configs = [_config(job, run) for job, run in zip(jobs[:MOST], runs, strict=True)]
     shown = [
         Shown(_name(config.source), _name(config.style), setting(overrides))
-        for config, overrides in zip(configs, told[:MOST], strict=True)
+        for config, overrides in zip(configs, settings[:MOST], strict=True)
     ]
     if not jobs:
         return
@@ -129,14 +130,13 @@ def write_figure(jobs: Sequence[Job], folder: RunFolder) -> None:
     drawn: dict[Any, Image.Image | str] = {}
 
     def picture(cell: Cell) -> Image.Image | str:
-        config = configs[cell.job]
-        record = records[cell.job]
+        config, run = configs[cell.job], runs[cell.job]
         key: tuple[Any, ...] = (cell.kind, cell.job)
         if cell.kind != "result":
-            told = repr((record.get("assets") or {}).get(cell.kind))
-            key = (cell.kind, repr(getattr(config, cell.kind)), told)
+            asset = repr((run.record.get("assets") or {}).get(cell.kind))
+            key = (cell.kind, repr(getattr(config, cell.kind)), asset)
         if key not in drawn:
-            drawn[key] = _picture(cell.kind, config, jobs[cell.job], record, size)
+            drawn[key] = _picture(cell.kind, config, run, size)
         return drawn[key]
 
     lines = [
@@ -145,23 +145,12 @@ def write_figure(jobs: Sequence[Job], folder: RunFolder) -> None:
     folder.write("figure.png", lambda path: _sheet(lines, size).save(path))
 
 
-def _record(job: Job) -> dict[str, Any]:
-    """A job's record; empty if it has none."""
-    from styleexp.runs import identity
-
-    try:
-        record = json.loads((job.folder / "run.json").read_text(encoding="utf-8"))
-        return {} if identity.not_of(job.key, job.overrides, record) else dict(record)
-    except (OSError, ValueError, AttributeError, TypeError):
-        return {}
-
-
-def _config(job: Job, record: dict[str, Any]) -> Config:
-    """A job's configuration, from its record or, if it never started, from its overrides."""
+def _config(job: Job, run: Run) -> Config:
+    """A job's configuration, from its run's record or, if it never started, from its overrides."""
     from styleexp.config import compose
 
-    if "config" in record:
-        return compose.recorded(record["config"])
+    if run.config:
+        return compose.recorded(run.record["config"])
     return compose.compose([*job.overrides, "hydra.mode=RUN"])
 
 
@@ -170,9 +159,7 @@ def _name(part: Any) -> str:
     return name if getattr(part, "scale", 1.0) == 1.0 else f"{name}, scale {part.scale:g}"
 
 
-def _picture(
-    kind: str, config: Config, job: Job, record: dict[str, Any], size: int
-) -> Image.Image | str:
+def _picture(kind: str, config: Config, run: Run, size: int) -> Image.Image | str:
     """A picture no larger than ``size``, or a text if there is none."""
     import copy
 
@@ -181,14 +168,15 @@ def _picture(
 
     from styleexp.config import sources
     from styleexp.inputs import meshes
-    from styleexp.runs import origins
+    from styleexp.runs import origins, results
     from styleexp.system.errors import UserError
 
     try:
         if kind != "result":
             part = copy.copy(getattr(config, kind))
-            if record.get("assets"):
-                part.path = str(origins.find(record, config, kind, job.folder) or "") or part.path
+            if run.record.get("assets"):
+                path = origins.find(run.record, config, kind, run.folder)
+                part.path = str(path or "") or part.path
             content: Any = None
             if kind == "source":
                 content = sources.load_source(part)
@@ -196,10 +184,9 @@ def _picture(
                 style = sources.load_style(part)
                 content = style.picture if style.mesh is None else style.mesh
         else:
-            status = reading.of_job(job)["status"]
-            if status != "done":
-                return "another run" if status == "other" else str(status)
-            content = meshes.load_mesh(job.folder / "result.ply")
+            if run.status != "done":
+                return "another run" if run.status == "other" else run.status
+            content = meshes.load_mesh(run.folder / results.NAME)
     except UserError as error:
         return "not found" if kind != "result" else str(error).split(":")[0]
     if isinstance(content, meshes.Mesh):

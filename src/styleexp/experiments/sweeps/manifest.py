@@ -15,10 +15,11 @@ from typing import Any
 
 from styleexp.experiments.sweeps.plan import Planned
 from styleexp.runs import reading, records
+from styleexp.runs.jobs import MANIFEST as NAME
+from styleexp.runs.reading import Run
 from styleexp.system import locks
 from styleexp.system.errors import UserError
 
-NAME = "manifest.json"
 SCHEMA = 1
 PATIENCE = 60.0
 """Seconds to wait for the manifest's lock."""
@@ -33,15 +34,15 @@ def write(folder: Path, jobs: Iterable[Planned]) -> None:
         before = read(folder)
         listed = {}
         for job in jobs:
-            found = reading.of_job(job)
-            refuse_others(job, found)
+            run = reading.of_job(job)
+            refuse_others(job, run)
             known = before.pop(job.name, {})
             known = known if known.get("key") == job.key else {}
             listed[job.name] = {
                 "key": job.key,
                 "experiment": job.entry,
                 "overrides": list(job.overrides),
-                "state": found["status"],
+                "state": run.status,
                 "attempts": known.get("attempts", 0),
             } | {k: known[k] for k in ("host", "process", "changed") if k in known}
         for name, known in before.items():
@@ -49,13 +50,13 @@ def write(folder: Path, jobs: Iterable[Planned]) -> None:
         _write(folder, listed)
 
 
-def refuse_others(job: Planned, found: dict[str, Any]) -> None:
+def refuse_others(job: Planned, run: Run) -> None:
     """Raise `UserError` if a job's folder contains another run, or one of a later version."""
-    if found["status"] == "newer":
-        raise UserError(f"cannot run in '{job.folder}': {found['reason']}")
-    if found["status"] == "other":
+    if run.status == "newer":
+        raise UserError(f"cannot run in '{job.folder}': {run.reason}")
+    if run.status == "other":
         raise UserError(
-            f"'{job.folder}' doesn't belong to this plan ({found['reason']}): move it away, or "
+            f"'{job.folder}' doesn't belong to this plan ({run.reason}): move it away, or "
             "choose another --folder."
         )
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
 
+from styleexp.runs import reading
 from styleexp.system.errors import UserError
 
 LEAST_IOU = "STYLEEXP_LEAST_IOU"
@@ -21,14 +21,13 @@ def objective(folder: Path) -> float:
     Reads ``style_distance`` and ``silhouette_iou`` from the run's ``metrics.json``; raises
     `UserError` if they are missing.
     """
-    path = folder / "metrics.json"
+    run = reading.read(folder)
     least = float(os.environ[LEAST_IOU])
-    try:
-        metrics = json.loads(path.read_text(encoding="utf-8"))
-        distance, iou = float(metrics["style_distance"]), float(metrics["silhouette_iou"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    missing = [name for name in ("style_distance", "silhouette_iou") if name not in run.metrics]
+    if missing:
         raise UserError(
-            f"a search needs style_distance and silhouette_iou in '{path}', but they can't be read "
-            f"({type(error).__name__})."
-        ) from error
+            f"a search needs style_distance and silhouette_iou in '{folder / 'metrics.json'}', but "
+            f"{' and '.join(missing)} can't be read."
+        )
+    distance, iou = run.metrics["style_distance"], run.metrics["silhouette_iou"]
     return distance + PENALTY * max(0.0, least - iou)

@@ -27,8 +27,9 @@ from pathlib import Path
 from typing import Any
 
 from styleexp.config.overrides import literal, quote, understood
-from styleexp.experiments.sweeps.jobs import Job, product, varying
+from styleexp.experiments.sweeps.settings import product, varying
 from styleexp.runs.identity import job_key
+from styleexp.runs.jobs import Job
 from styleexp.system.errors import UserError, unknown_name
 
 
@@ -82,8 +83,8 @@ def read(path: Path) -> Plan:
     except FileNotFoundError:
         raise UserError(f"there is no plan '{path}': give a YAML file, see sweeps/.") from None
     except (OSError, ValueError, yaml.YAMLError) as error:
-        told = " ".join(str(error).split())
-        raise UserError(f"the plan '{path}' can't be read: {told}.") from error
+        message = " ".join(str(error).split())
+        raise UserError(f"the plan '{path}' can't be read: {message}.") from error
     if not isinstance(content, dict) or not content.get("experiments"):
         raise UserError(f"the plan '{path}' lists no experiments: see sweeps/ for examples.")
     entries = []
@@ -162,10 +163,10 @@ def jobs(plan: Plan, folder: Path, overrides: Sequence[str] = ()) -> dict[str, l
             assert entry.name is not None
             listed = [each for part in _parts(plan, entry, overrides) for each in part]
             made = []
-            for each, told in zip(listed, varying(listed), strict=True):
+            for each, settings in zip(listed, varying(listed), strict=True):
                 config = compose.typed(hydra.compose("config", [*each, "hydra.mode=RUN"]))
                 key = job_key(config)
-                name = f"{entry.name}/{_readable(told)}-{key[:8]}"
+                name = f"{entry.name}/{_readable(settings)}-{key[:8]}"
                 job = Planned(name, tuple(each), folder / name, key, entry.name)
                 shared = first.setdefault(key, job)
                 made.append(dataclasses.replace(job, name=shared.name, folder=shared.folder))

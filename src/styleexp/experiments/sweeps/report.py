@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from hydra.experimental.callback import Callback
 
 from styleexp.experiments.sweeps import claim
-from styleexp.experiments.sweeps.jobs import Job, planned, readable, varying
+from styleexp.experiments.sweeps.settings import readable, varying
 from styleexp.runs import reading
+from styleexp.runs.jobs import Job, planned
 from styleexp.runs.records import RunFolder
 from styleexp.system.errors import UserError
 
@@ -55,7 +56,7 @@ def _claimed(claim_: Callable[[DictConfig], T], config: DictConfig) -> T | None:
 
 def exit_code(folder: Path) -> int:
     """0 if every job of the sweep is done, else 2; based on the jobs' own status."""
-    states = {reading.of_job(job)["status"] for job in planned(folder)}
+    states = {reading.of_job(job).status for job in planned(folder)}
     return 0 if states == {"done"} else 2
 
 
@@ -94,9 +95,9 @@ def table(jobs: Sequence[Job]) -> list[dict[str, Any]]:
         run = reading.of_job(job)
         row: dict[str, Any] = {"job": job.name}
         row |= {f"={key}": value for key, value in overrides.items()}
-        row |= {key: run[key] for key in ("status", "seconds", "loss")}
-        row |= {k.removeprefix("metric."): v for k, v in run.items() if k.startswith("metric.")}
-        row["reason"] = run["reason"]
+        row |= {"status": run.status, "seconds": run.seconds, "loss": run.loss}
+        row |= run.measured
+        row["reason"] = run.remark
         rows.append(row)
     return rows
 

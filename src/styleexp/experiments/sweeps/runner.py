@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any
 
 from styleexp.config.overrides import quote
 from styleexp.experiments.sweeps import launchers, manifest
-from styleexp.experiments.sweeps.jobs import Job
-from styleexp.runs import reading, records
+from styleexp.runs import identity, reading, records
+from styleexp.runs.jobs import Job
 from styleexp.system import locks
 from styleexp.system.errors import UserError
 
@@ -54,9 +54,9 @@ def run(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> None:
             manifest.write(folder, jobs)
         states = {}
         for job in jobs:
-            found = reading.of_job(job)
-            manifest.refuse_others(job, found)
-            states[job.name] = found["status"]
+            run = reading.of_job(job)
+            manifest.refuse_others(job, run)
+            states[job.name] = run.status
             if states[job.name] not in manifest.ENDED and deaths[job.name] >= MOST_DEATHS:
                 _give_up(job, folder)
                 states[job.name] = "failed"
@@ -70,7 +70,7 @@ def run(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> None:
         batch = [job for job in waiting if job.name not in suspects] or waiting[:1]
         before = _progress(folder, batch)
         error = _launch(batch, folder, launcher)
-        after = {job.name: reading.of_job(job)["status"] for job in batch}
+        after = {job.name: reading.of_job(job).status for job in batch}
         died = [name for name, state in after.items() if state == "died"]
         if error is not None and not set(after.values()) & set(manifest.ENDED):
             # No progress: some job can't even write a status, for example for lack of space.
@@ -91,7 +91,7 @@ def run(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> None:
 def retry(jobs: Sequence[Planned]) -> None:
     """Mark failed jobs to run again, from their checkpoints if they have one."""
     for job in jobs:
-        if reading.of_job(job)["status"] != "failed":
+        if reading.of_job(job).status != "failed":
             continue
         with suppress(locks.Busy), locks.hold(job.folder):
             again = "failed, to be retried"
@@ -158,7 +158,7 @@ def _launch(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> E
 
 def _settle(jobs: Sequence[Planned]) -> None:
     """Wait for jobs that are still running after another one was killed."""
-    while any(reading.of_job(job)["status"] == "running" for job in jobs):
+    while any(reading.of_job(job).status == "running" for job in jobs):
         time.sleep(POLL)
 
 
@@ -187,7 +187,7 @@ def task(config: DictConfig) -> None:
             # No key: the manifest was removed; the runner rewrites it.
             key = manifest.read(root).get(name, {}).get("key")
             job = Job(name, tuple(given), folder, key)
-            state = reading.of_job(job)["status"] if key else reading.status(folder)
+            state = reading.of_job(job).status if key else reading.read(folder).last_status
             if state not in (*manifest.ENDED, "other"):  # the runner rejects another run's folder
                 _work(config, root, job)
     except locks.Busy:
@@ -214,7 +214,6 @@ def _work(config: DictConfig, root: Path, job: Job) -> None:
     """Run a job whose lock is held, with its output redirected to its log."""
     from styleexp.config import compose
     from styleexp.experiments.execute import begin
-    from styleexp.runs import identity
 
     name, folder = job.name, job.folder
     begun = time.perf_counter()
@@ -226,21 +225,21 @@ def _work(config: DictConfig, root: Path, job: Job) -> None:
         redirect_stderr(log),
     ):
         try:
-            told = [each for each in job.overrides if not each.startswith("launcher=")]
+            asked = [each for each in job.overrides if not each.startswith("launcher=")]
             typed = compose.typed(config)
             if job.key not in (None, identity.job_key(typed)):
                 raise UserError(
                     "its source or style file has changed since the plan was read: start the plan "
                     "again."
                 )
-            code = begin(typed, folder, [*told, "hydra.mode=RUN"])
+            code = begin(typed, folder, [*asked, "hydra.mode=RUN"])
         except UserError as error:
             _failed(folder, str(error))
             print(f"styleexp: {error}")
         except Exception as error:
             _failed(folder, records.first_line(error))
             traceback.print_exc()
-    state = str(reading.status(folder))
+    state = str(reading.read(folder).last_status)
     listed = manifest.update(root, name, state)
     done = sum(job["state"] == "done" for job in listed.values())
     current = sum(job["state"] != "outdated" for job in listed.values())
@@ -252,5 +251,5 @@ def _work(config: DictConfig, root: Path, job: Job) -> None:
 
 def _failed(folder: Path, reason: str) -> None:
     """Write a status if the run failed before it could."""
-    if reading.status(folder) != "failed":
+    if reading.read(folder).last_status != "failed":
         records.RunFolder(folder).write_status("failed", reason=reason)

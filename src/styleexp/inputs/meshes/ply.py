@@ -63,15 +63,6 @@ def numbers(columns: dict[str, Column], *names: str) -> np.ndarray:
     return np.stack(found, axis=1).astype(np.float64)
 
 
-def stored_result(data: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Vertices (n, 3), faces (m, 3) and displacement (n,) of a ``result.ply``, in file order."""
-    elements = parse(data).elements
-    vertex, corners = elements["vertex"], elements["face"]["vertex_indices"]
-    assert isinstance(corners, Lists)
-    values = numbers(vertex, "displacement")[:, 0] if "displacement" in vertex else None
-    return numbers(vertex, *"xyz"), corners.values.astype(np.int64).reshape(-1, 3), values
-
-
 def parse(data: bytes) -> Ply:
     """Read a PLY file, ASCII or binary.
 
