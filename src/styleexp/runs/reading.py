@@ -277,9 +277,10 @@ def _steps(path: Path) -> tuple[list[dict[str, float]], int]:
         return [], 0
     for line in lines:
         try:
-            found = {key: untrusted.number(value) for key, value in json.loads(line).items()}
-            numbers = {key: value for key, value in found.items() if value is not None}
-            steps.append({**numbers, "step": int(numbers["step"])})
+            values = json.loads(line).items()
+            step = {key: n for key, value in values if (n := untrusted.number(value)) is not None}
+            step["step"] = int(step["step"])
+            steps.append(step)
         except (ValueError, KeyError, AttributeError, OverflowError, RecursionError):
             damaged += 1
     return steps, damaged

@@ -93,7 +93,9 @@ def is_below(name: str) -> bool:
 
 def number(value: Any) -> int | float | None:
     """The value if it is a number that a float can hold, else None."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
+    if isinstance(value, float):
+        return value
+    if isinstance(value, bool) or not isinstance(value, int):
         return None
     try:
         float(value)
