@@ -18,9 +18,10 @@ import numpy as np
 import pytest
 import torch
 
+from styleexp.config.checks import check
 from styleexp.config.compose import compose
 from styleexp.config.explain import explain
-from styleexp.config.schema import Config, check
+from styleexp.config.schema import Config
 from styleexp.inputs import meshes
 from styleexp.inputs.images import load_image
 from styleexp.method.views import look_at, orbit

@@ -11,18 +11,16 @@ from PIL import Image
 import styleexp
 from styleexp.config import build, sources
 from styleexp.config.compose import compose
-from styleexp.config.schema import Config, StyleConfig
 from styleexp.method import pictures
 from styleexp.method.height_maps import picture_side
+from styleexp.method.options import StyleConfig
 from styleexp.system.errors import UserError
 
 MAP = ("method=displacement_map", "source.refine=none")
-SYNTHESIS = Config(baseline=True)  # anything but the method that compares with tone
 
 
 def heights_of(picture, **style):
-    config = Config(style=StyleConfig(name="picture", **style), baseline=SYNTHESIS.baseline)
-    return pictures.picture_height(config, picture)
+    return pictures.picture_height(StyleConfig(name="picture", **style), picture)
 
 
 def bumps(size=96, waves=3.0):
