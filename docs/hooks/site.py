@@ -5,6 +5,7 @@ import dataclasses
 import importlib
 import io
 import re
+import typing
 from contextlib import redirect_stdout, suppress
 from functools import cache
 from pathlib import Path
@@ -18,7 +19,7 @@ PACKAGE = ROOT / "src" / "styleexp"
 
 API = {
     "The method": (
-        "api", "method.gram", "method.scene", "method.fields", "method.height_maps", "method.surface", "method.views", "method.viewer", "method.losses", "method.targets", "method.relief", "config.schema", "method.baselines", "method.baselines.geometric_textures",
+        "api", "method.base", "method.paper", "method.stepping", "method.subject", "method.scene", "method.options", "method.fields", "method.height_maps", "method.surface", "method.views", "method.viewer", "method.losses", "method.targets", "method.relief", "method.refinement", "config.schema", "config.build", "method.baselines", "method.baselines.geometric_textures",
     ),
     "Synthesis on the surface": ("method.synthesis", "method.synthesis.method", "method.synthesis.shape", "method.synthesis.exemplar",
                                  "method.synthesis.direction", "method.synthesis.walk", "method.synthesis.optimise", "method.synthesis.room"),
@@ -29,9 +30,9 @@ API = {
     "Renderers": ("renderers.base", "renderers.soft_raster", "renderers.soft_raster.renderer",
                   "renderers.soft_raster.raster", "renderers.soft_raster.contour",
                   "renderers.soft_raster.shading", "renderers.soft_raster.deferred",
-                  "renderers.mitsuba_ad", "renderers.moderngl_deferred", "testing"),
-    "Encoders": ("encoders", "encoders.vgg", "encoders.fused", "encoders.clip", "encoders.weights"),
-    "Parts and plugins": ("plugins.spec", "plugins", "plugins.loggers", "system.errors"),
+                  "renderers.mitsuba_ad", "renderers.moderngl_deferred"),
+    "Encoders": ("encoders", "encoders.base", "encoders.vgg", "encoders.fused", "encoders.clip", "inputs.weights"),
+    "Parts and plugins": ("plugins", "plugins.spec", "plugins.catalogue", "plugins.loggers", "testing", "testing.renderers", "testing.losses", "testing.fields", "testing.encoders", "testing.styles", "testing.methods", "system.options", "system.errors"),
     "Runs, metrics, reports": ("runs.records", "runs.reading", "runs.finding", "runs.jobs", "runs.results", "runs.untrusted", "runs.identity", "runs.origins", "experiments.execute", "experiments.metrics", "experiments.metrics.style", "experiments.metrics.shape",
                                "experiments.metrics.truth", "experiments.reports", "experiments.reports.collect",
                                "experiments.reports.reliability", "experiments.reports.study_results", "experiments.sweeps.claim", "experiments.sweeps.plan", "experiments.sweeps.runner", "experiments.agreement", "method.gram_cache", "experiments.bench.render", "experiments.bench.step"),
@@ -93,7 +94,7 @@ def repository_link(text, target, anchor, page):
     return text if path.name in text.strip("`") or told in text else f"{text} (`{told}`)"
 
 
-def on_post_page(output, page, schema):
+def on_post_page(output, page, config):
     """Refuse a page that would ask another machine for something. The search's helper for file://,
     which the theme would load from elsewhere, is here."""
     output = output.replace(SHIM, relative(page.url) + "assets/iframe-worker.js")
@@ -134,7 +135,6 @@ def configuration():
     from styleexp import plugins
     from styleexp.config import schema
 
-    module = source("config.schema")
     out = [
         "# Configuration",
         "Every key of a run, as `styleexp KEY=VALUE` takes it, with the default of the schema. "
@@ -143,16 +143,16 @@ def configuration():
         "values that a choice of them gives. This page is made from "
         "`styleexp/config/schema.py` and the options of the registered parts when the site is built.",
     ]
-    top = []
-    for field in dataclasses.fields(schema.Config):
-        kind = getattr(schema, f"{_camel(field.name)}Config", None)
-        if kind is None or field.name in ("baseline", "logger", "renderer"):
-            top.append(_row(module["Config"], field, field.name, schema))
+    kinds = typing.get_type_hints(schema.Config)
+    sections = {name: kind for name, kind in kinds.items() if dataclasses.is_dataclass(kind)}
+    top = [
+        _row(schema.Config, field, field.name)
+        for field in dataclasses.fields(schema.Config)
+        if field.name not in sections
+    ]
     out += ["## The run itself", *_table(top)]
-    for field in dataclasses.fields(schema.Config):
-        kind = getattr(schema, f"{_camel(field.name)}Config", None)
-        if kind is not None:
-            out += _section(module, kind.__name__, field.name, schema)
+    for name, kind in sections.items():
+        out += _section(kind, name)
     out.append("## Options of parts")
     out.append(
         "What a part has beside its `name` and the keys above, written `KIND.KEY=VALUE` "
@@ -163,38 +163,46 @@ def configuration():
         for spec in about.built_in.values():
             if spec.config is about.base:
                 continue
-            owner = source(spec.config.__module__.removeprefix("styleexp."))
             inherited = {f.name for f in dataclasses.fields(about.base)} if about.base else set()
             prefix = f"{kind}.{spec.name}" if kind == "logger" else kind
             for field in dataclasses.fields(spec.config):
                 if field.name != "name" and field.name not in inherited:
-                    row = _row(owner[spec.config.__name__], field, f"{prefix}.{field.name}", schema)
+                    row = _row(spec.config, field, f"{prefix}.{field.name}")
                     rows.append((f"`{spec.name}`", *row))
         if rows:
             out += [f"### {kind}", *_table(rows, ("name", "key", "default", "meaning"))]
     return "\n\n".join(out) + "\n"
 
 
-def _section(module, name, prefix):
-    written = module[name]
+def _section(kind, prefix):
     rows, nested = [], []
-    for field in dataclasses.fields(getattr(schema, name)):
-        if field.name == "local":
-            nested = _section(module, "LocalViewsConfig", f"{prefix}.local", schema)
+    for field in dataclasses.fields(kind):
+        inner = typing.get_type_hints(kind)[field.name]
+        if dataclasses.is_dataclass(inner):
+            nested = _section(inner, f"{prefix}.{field.name}")
         else:
-            rows.append(_row(written, field, f"{prefix}.{field.name}", schema))
-    return [f"## {prefix}", _prose(written.docstring.value), *_table(rows), *nested]
+            rows.append(_row(kind, field, f"{prefix}.{field.name}"))
+    return [f"## {prefix}", _prose(_written(kind).docstring.value), *_table(rows), *nested]
 
 
-def _row(written, field, key, schema):
-    attribute = written.members[field.name]
+def _written(kind):
+    """A dataclass as it is written."""
+    return source(kind.__module__.removeprefix("styleexp."))[kind.__name__]
+
+
+def _row(kind, field, key):
+    owner = next(
+        each for each in kind.__mro__ if field.name in vars(each).get("__annotations__", ())
+    )
+    attribute = _written(owner).members[field.name]
     told = [_prose(attribute.docstring.value)] if attribute.docstring else []
-    if key in schema.CHOICES:
-        told.append("One of " + ", ".join(f"`{each}`" for each in schema.CHOICES[key]) + ".")
-    elif key in schema.BETWEEN:
-        told.append("From {} to {}.".format(*schema.BETWEEN[key]))
-    elif key in schema.POSITIVE:
-        told.append("Above 0.")
+    limits = field.metadata
+    if "choices" in limits:
+        told.append("One of " + ", ".join(f"`{each}`" for each in limits["choices"]) + ".")
+    if "between" in limits:
+        told.append("From {} to {}.".format(*limits["between"]))
+    elif "above" in limits:
+        told.append(f"Above {limits['above']}.")
     return f"`{key}`", f"`{_default(field)}`", " ".join(told)
 
 
@@ -219,10 +227,6 @@ def _table(rows, head=("key", "default", "meaning")):
 
 def _prose(text):
     return re.sub(r"``(.*?)``", r"`\1`", " ".join(text.split()))
-
-
-def _camel(name):
-    return {"optim": "Optim"}.get(name, name.capitalize())
 
 
 # ------------------------------------------------------------------------------------ commands, API

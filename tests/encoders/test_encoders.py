@@ -11,8 +11,8 @@ import torch
 from torch.nn import functional
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from styleexp.encoders import VGG, fused, vgg, weights
-from styleexp.inputs import assets
+from styleexp.encoders import VGG, fused, vgg
+from styleexp.inputs import assets, weights
 from styleexp.plugins import load_encoder
 from styleexp.plugins.catalogue import ENCODERS
 from styleexp.system.errors import UserError

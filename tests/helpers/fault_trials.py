@@ -958,7 +958,7 @@ def _fetch(stage: Stage, url: str, body: bytes, cache: Path) -> subprocess.Popen
 def bad_download(stage: Stage, chance: random.Random, fault: str) -> str:
     """Weights are fetched from a server that sends half of them or something else, or the process
     is killed, or the cache's disk is full, in the middle; then from a whole one."""
-    from styleexp.encoders import weights
+    from styleexp.inputs import weights
 
     body, cache = _shelf(stage), stage.folder / f"cache-{chance.random()}"
     room = disk(cache, 16 << 10) if fault == "full" else contextlib.nullcontext()

@@ -17,8 +17,7 @@ import pytest
 import torch
 
 from styleexp.cli.assets import main
-from styleexp.encoders import weights
-from styleexp.inputs import assets
+from styleexp.inputs import assets, weights
 from styleexp.inputs.assets import ASSETS, Asset
 from styleexp.system.errors import UserError
 
@@ -363,7 +362,7 @@ def test_two_processes_at_once(index, cache):
         f"""
         import logging, sys
         from styleexp.inputs import assets
-        from styleexp.encoders import weights
+        from styleexp.inputs import weights
         logging.basicConfig(level="INFO")
         assets.ASSETS["tiny"] = {ASSETS["tiny"]!r}
         print("ready", flush=True)

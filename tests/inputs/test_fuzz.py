@@ -326,6 +326,7 @@ MEASURE = """
 import resource
 import torch
 from tests.inputs.test_fuzz import pile, views
+from styleexp.testing import rendering
 from styleexp.testing import renderers as testing
 from styleexp.renderers.base import Shading
 from styleexp.renderers.soft_raster import SoftRaster
@@ -344,7 +345,7 @@ triangles, as long as one view's faces are below `deferred.MOST_PAIRS`."""
 
 @pytest.mark.parametrize(
     ("mesh", "count", "size"),
-    [("pile(1500)", 12, 64), ("testing.icosphere(6)", 384, 9)],
+    [("pile(1500)", 12, 64), ("rendering.icosphere(6)", 384, 9)],
     ids=["huge triangles", "many views"],
 )
 def test_memory_is_bounded(mesh, count, size):

@@ -10,7 +10,7 @@ import trimesh
 import styleexp
 from styleexp.config import build
 from styleexp.config.compose import compose
-from styleexp.inputs import meshes, shapes
+from styleexp.inputs import meshes, shapes, spheres
 from styleexp.method import scene
 from styleexp.method.patches import relief_of_mesh
 from styleexp.method.synthesis.direction import FLOW, UP, direction_field, turned
@@ -199,7 +199,7 @@ def test_room_is_half_the_thickness_inside_and_half_the_gap_outside():
 
 def test_many_components_are_one_relief():
     """Overlapping balls round a big one: bumps as high as the balls stand out."""
-    ways = shapes._fibonacci(40)
+    ways = spheres.fibonacci(40)
     balls = [trimesh.creation.icosphere(2, radius=0.3).apply_translation(0.8 * way) for way in ways]
     joined = trimesh.util.concatenate([trimesh.creation.icosphere(3, radius=0.7), *balls])
     exemplar = exemplar_of(meshes.from_arrays(joined.vertices, joined.faces))

@@ -19,6 +19,7 @@ from styleexp.renderers.mitsuba_ad import MitsubaAD
 from styleexp.renderers.soft_raster import SoftRaster
 from styleexp.system.errors import UserError
 from styleexp.testing import renderers as testing
+from styleexp.testing import rendering
 from tests.helpers import warm
 
 for package in ("mitsuba", "drjit"):
@@ -72,7 +73,7 @@ def test_agrees_with_soft_raster(named_mesh, name: str, normals: str, outlines: 
     surface = normalised(load_mesh(named_mesh(name)), torch.device("cpu"))[1]
     cameras = orbit(torch.tensor([0.1, -0.4]), torch.tensor([0.4, 2.5]), 2.0, 60.0)
     shading = Shading(normals=normals, outlines=outlines)
-    weight = testing._weight(200)[:, :, None]
+    weight = rendering.pixel_weights(200)[:, :, None]
 
     def draw(renderer: MitsubaAD | SoftRaster) -> tuple[RenderOutput, Tensor]:
         moved = surface.vertices.clone().requires_grad_()
@@ -112,8 +113,8 @@ def _broad(vertices: Tensor) -> Tensor:
 
 
 def test_seed_decides_the_samples() -> None:
-    vertices, faces = testing.bumpy_sphere(3)
-    arguments = (vertices, faces, testing._cameras(1), Shading(), (40, 40))
+    vertices, faces = rendering.bumpy_sphere(3)
+    arguments = (vertices, faces, rendering.cameras_around(1), Shading(), (40, 40))
     first, again = (made(MitsubaAD).render(*arguments).image for _ in range(2))
     assert torch.equal(first, again)
     other = MitsubaAD(seed=7).render(*arguments).image
@@ -123,8 +124,8 @@ def test_seed_decides_the_samples() -> None:
 
 def test_any_number_of_samples() -> None:
     """Numbers that can't be spread evenly are rounded up; few samples give the same on average."""
-    vertices, faces = testing.bumpy_sphere(3)
-    arguments = (faces, testing._cameras(2), Shading(normals="smooth"), (30, 40))
+    vertices, faces = rendering.bumpy_sphere(3)
+    arguments = (faces, rendering.cameras_around(2), Shading(normals="smooth"), (30, 40))
     results = []
     for renderer in (made(MitsubaAD), MitsubaAD(spp=5, sppc=3), MitsubaAD(1, 1, 1)):
         moved = vertices.clone().requires_grad_()
@@ -137,8 +138,8 @@ def test_any_number_of_samples() -> None:
 
 
 def test_precision_follows_the_vertices() -> None:
-    vertices, faces = testing.bumpy_sphere(2)
-    arguments = (faces, testing._cameras(2), Shading(), (20, 30))
+    vertices, faces = rendering.bumpy_sphere(2)
+    arguments = (faces, rendering.cameras_around(2), Shading(), (20, 30))
     single = made(MitsubaAD).render(vertices, *arguments)
     moved = vertices.double().requires_grad_()
     double = made(MitsubaAD).render(moved, *arguments)
@@ -151,12 +152,13 @@ def test_precision_follows_the_vertices() -> None:
 
 def test_renders_of_one_graph_keep_their_meshes() -> None:
     """Gradients are those of the mesh that was drawn, whatever was drawn since."""
-    vertices, faces = testing.bumpy_sphere(3)
+    vertices, faces = rendering.bumpy_sphere(3)
     shading = Shading(normals="smooth")
 
     def total(moved: Tensor) -> Tensor:
-        image = made(MitsubaAD).render(moved, faces, testing._cameras(2), shading, (40, 40)).image
-        return (image * testing._weight(40)[:, :, None]).sum()
+        drawn = made(MitsubaAD).render(moved, faces, rendering.cameras_around(2), shading, (40, 40))
+        image = drawn.image
+        return (image * rendering.pixel_weights(40)[:, :, None]).sum()
 
     points = [(scale * vertices).requires_grad_() for scale in (1.0, 0.7)]
     apart = [torch.autograd.grad(total(moved), moved)[0] for moved in points]
@@ -166,15 +168,15 @@ def test_renders_of_one_graph_keep_their_meshes() -> None:
 
 
 def test_mistakes_are_user_errors() -> None:
-    vertices, faces = testing.icosphere(0)
+    vertices, faces = rendering.icosphere(0)
     render = made(MitsubaAD).render
     for options in ({"spp": 0}, {"sppc": 0}, {"sppp": -1}, {"seed": -1}):
         with pytest.raises(UserError, match=next(iter(options))):
             MitsubaAD(**options)
     with pytest.raises(UserError, match="smooth"):
-        render(vertices, faces, testing._front_camera(), Shading(normals="smoth"), (4, 4))
+        render(vertices, faces, rendering.front_camera(), Shading(normals="smoth"), (4, 4))
     with pytest.raises(UserError, match="device=cpu"):
-        render(vertices.to("meta"), faces, testing._front_camera(), Shading(), (4, 4))
+        render(vertices.to("meta"), faces, rendering.front_camera(), Shading(), (4, 4))
 
 
 def _command(folder, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:

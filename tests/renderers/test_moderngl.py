@@ -20,6 +20,7 @@ from styleexp.renderers.moderngl_deferred import ModernGLDeferred
 from styleexp.renderers.soft_raster import SoftRaster
 from styleexp.system.errors import UserError
 from styleexp.testing import renderers as testing
+from styleexp.testing import rendering
 from tests.helpers import warm
 from tests.helpers.needed import available
 
@@ -106,7 +107,7 @@ def test_agrees_with_soft_raster_close_up(renderer):
 
 
 def test_hard_outlines(renderer):
-    vertices, faces = testing.icosphere(4)
+    vertices, faces = rendering.icosphere(4)
     camera = zoom(orbit(torch.zeros(1), torch.zeros(1), 3.0, 40.0), 0.9)
     out = ModernGLDeferred("none").render(vertices, faces, camera, Shading(), (64, 64))
     assert set(out.coverage.unique().tolist()) == {0.0, 1.0}
@@ -115,8 +116,8 @@ def test_hard_outlines(renderer):
 
 def test_double_precision_and_other_sizes_in_turn(renderer):
     """Buffers are reused between calls: nothing of a larger image is left over in a smaller one."""
-    vertices, faces = testing.bumpy_sphere(3)
-    small, small_faces = testing.icosphere(1)
+    vertices, faces = rendering.bumpy_sphere(3)
+    small, small_faces = rendering.icosphere(1)
     for size in ((90, 70), (33, 70), (120, 50), (90, 70)):
         out = renderer.render(vertices.double(), faces, around(), Shading(), size)
         assert out.image.dtype == torch.float64
@@ -127,7 +128,7 @@ def test_double_precision_and_other_sizes_in_turn(renderer):
 
 
 def test_more_views_than_fit_into_one_image(renderer, monkeypatch):
-    vertices, faces = testing.bumpy_sphere(3)
+    vertices, faces = rendering.bumpy_sphere(3)
     whole = renderer.render(vertices, faces, around(), Shading(), (60, 60))
     monkeypatch.setattr(moderngl_deferred._canvas(), "largest", 130)
     parts = renderer.render(vertices, faces, around(), Shading(), (60, 60))
@@ -150,7 +151,7 @@ def test_nearly_equal_depths_are_told_apart(renderer):
 
 
 def test_one_context_for_each_thread(renderer):
-    vertices, faces = testing.bumpy_sphere(2)
+    vertices, faces = rendering.bumpy_sphere(2)
     arguments = (vertices, faces, around(), Shading(), (40, 40))
     expected = renderer.render(*arguments)
     here = moderngl_deferred._canvas()
@@ -169,7 +170,7 @@ def test_one_context_for_each_thread(renderer):
 def test_another_context_in_the_same_process_lives_on(renderer):
     import moderngl
 
-    vertices, faces = testing.bumpy_sphere(2)
+    vertices, faces = rendering.bumpy_sphere(2)
     expected = renderer.render(vertices, faces, around(), Shading(), (40, 40))
     other = moderngl.create_context(standalone=True, backend="egl")
     image = other.simple_framebuffer((8, 8))
@@ -214,9 +215,9 @@ from styleexp.testing import renderers as testing
 from styleexp.system.errors import UserError
 from styleexp.renderers.base import Shading
 from styleexp.renderers.moderngl_deferred import ModernGLDeferred
-renderer, (vertices, faces) = ModernGLDeferred(), testing.icosphere(2)
+renderer, (vertices, faces) = ModernGLDeferred(), rendering.icosphere(2)
 def covered():
-    out = renderer.render(vertices, faces, testing._cameras(1), Shading(), (32, 32))
+    out = renderer.render(vertices, faces, rendering.cameras_around(1), Shading(), (32, 32))
     return int((out.face_ids >= 0).sum())
 before = covered()
 import pyrender
@@ -279,7 +280,7 @@ def test_without_the_package_one_sentence_names_the_remedy(tmp_path, package):
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_cuda_tensors(renderer):
-    vertices, faces = testing.bumpy_sphere(4)
+    vertices, faces = rendering.bumpy_sphere(4)
     on_cpu, gradient = rendered(renderer, vertices, faces, around(), "smooth")
     moved = vertices.cuda().requires_grad_()
     out = renderer.render(moved, faces.cuda(), around(), Shading(normals="smooth"), (160, 200))

@@ -34,6 +34,7 @@ from styleexp.renderers.soft_raster.shading import (
 )
 from styleexp.system.errors import UserError
 from styleexp.testing import renderers as testing
+from styleexp.testing import rendering
 
 
 class HardRaster(SoftRaster):
@@ -76,10 +77,10 @@ def test_check_renderer_reports_all_failures(monkeypatch: pytest.MonkeyPatch) ->
 def test_unknown_names_are_user_errors() -> None:
     with pytest.raises(UserError, match="contour"):
         SoftRaster("countour")
-    vertices, faces = testing.icosphere(0)
+    vertices, faces = rendering.icosphere(0)
     with pytest.raises(UserError, match="smooth"):
         SoftRaster().render(
-            vertices, faces, testing._front_camera(), Shading(normals="smoth"), (4, 4)
+            vertices, faces, rendering.front_camera(), Shading(normals="smoth"), (4, 4)
         )
 
 
@@ -176,8 +177,8 @@ def test_gradcheck_compose() -> None:
 @pytest.mark.parametrize("normals", ["flat", "smooth"])
 def test_gradcheck_of_shading_through_the_renderer(normals: str) -> None:
     """Hard visibility does not change under tiny steps, so the whole render is checked."""
-    vertices, faces = testing.bumpy_sphere(1)
-    camera = testing._cameras(2)
+    vertices, faces = rendering.bumpy_sphere(1)
+    camera = rendering.cameras_around(2)
     assert gradcheck(
         lambda v: (
             SoftRaster("none").render(v, faces, camera, Shading(normals=normals), (9, 9)).image
@@ -187,8 +188,8 @@ def test_gradcheck_of_shading_through_the_renderer(normals: str) -> None:
 
 
 def test_double_precision_agrees_with_single() -> None:
-    vertices, faces = testing.bumpy_sphere(3)
-    arguments = (faces, testing._cameras(2), Shading(normals="smooth"), (64, 64))
+    vertices, faces = rendering.bumpy_sphere(3)
+    arguments = (faces, rendering.cameras_around(2), Shading(normals="smooth"), (64, 64))
     single = SoftRaster().render(vertices, *arguments)
     double = SoftRaster().render(vertices.double(), *arguments)
     assert double.image.dtype == double.coverage.dtype == torch.float64
@@ -197,12 +198,12 @@ def test_double_precision_agrees_with_single() -> None:
 
 @pytest.mark.parametrize("normals", ["flat", "smooth"])
 def test_same_input_same_bits(normals: str) -> None:
-    vertices, faces = testing.bumpy_sphere(4)
+    vertices, faces = rendering.bumpy_sphere(4)
 
     def run() -> tuple[Tensor, Tensor]:
         moved = vertices.clone().requires_grad_()
         out = SoftRaster().render(
-            moved, faces, testing._cameras(3), Shading(normals=normals), (100, 100)
+            moved, faces, rendering.cameras_around(3), Shading(normals=normals), (100, 100)
         )
         (gradient,) = torch.autograd.grad((out.image**2).sum() + out.coverage.sum(), moved)
         return out.image.detach(), gradient
@@ -216,8 +217,8 @@ def test_the_same_pixels_in_any_portions() -> None:
     """How much the rasteriser works on at once changes nothing."""
     from styleexp.renderers.soft_raster import raster, shading
 
-    vertices, faces = testing.bumpy_sphere(2)
-    arguments = (vertices, faces, testing._cameras(2), Shading(normals="smooth"), (90, 70))
+    vertices, faces = rendering.bumpy_sphere(2)
+    arguments = (vertices, faces, rendering.cameras_around(2), Shading(normals="smooth"), (90, 70))
     whole = SoftRaster().render(*arguments)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(raster, "_CHUNK", 500)
@@ -228,8 +229,8 @@ def test_the_same_pixels_in_any_portions() -> None:
 
 
 def test_outlines_are_antialiased_and_hard_without() -> None:
-    vertices, faces = testing.icosphere(4)
-    arguments = (vertices, faces, testing._cameras(1), Shading(), (64, 64))
+    vertices, faces = rendering.icosphere(4)
+    arguments = (vertices, faces, rendering.cameras_around(1), Shading(), (64, 64))
     soft, hard = SoftRaster().render(*arguments), SoftRaster("none").render(*arguments)
     assert set(hard.coverage.unique().tolist()) == {0.0, 1.0}
     between = (soft.coverage > 0.01) & (soft.coverage < 0.99)
@@ -239,8 +240,8 @@ def test_outlines_are_antialiased_and_hard_without() -> None:
 
 def test_topology_follows_the_faces() -> None:
     """The remembered neighbours are those of the faces given, also if changed in place."""
-    vertices, faces = testing.bumpy_sphere(2)
-    renderer, arguments = SoftRaster(), (testing._cameras(1), Shading(), (40, 40))
+    vertices, faces = rendering.bumpy_sphere(2)
+    renderer, arguments = SoftRaster(), (rendering.cameras_around(1), Shading(), (40, 40))
     renderer.render(vertices, faces, *arguments)
     faces[: len(faces) // 2] = faces[0].clone()
     again = renderer.render(vertices, faces, *arguments)
@@ -257,11 +258,11 @@ def test_neighbours_of_a_strip() -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("normals", ["flat", "smooth"])
 def test_cuda_equals_cpu(normals: str) -> None:
-    vertices, faces = testing.bumpy_sphere(4)
+    vertices, faces = rendering.bumpy_sphere(4)
     results = []
     for device in ("cpu", "cuda"):
         moved = vertices.to(device).requires_grad_()
-        cameras = testing._cameras(3)
+        cameras = rendering.cameras_around(3)
         out = SoftRaster().render(
             moved, faces.to(device), cameras, Shading(normals=normals), (100, 100)
         )
@@ -276,7 +277,7 @@ def test_cuda_equals_cpu(normals: str) -> None:
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_the_host_waits_for_the_device_as_often_for_many_views_and_never_backward() -> None:
-    vertices, faces = testing.bumpy_sphere(3)
+    vertices, faces = rendering.bumpy_sphere(3)
     vertices, faces = vertices.cuda().requires_grad_(), faces.cuda()
     renderer, shading = SoftRaster(), Shading(normals="smooth")
     waits = []
@@ -285,7 +286,9 @@ def test_the_host_waits_for_the_device_as_often_for_many_views_and_never_backwar
             with warnings.catch_warnings(record=True) as told:
                 warnings.simplefilter("always")
                 torch.cuda.set_sync_debug_mode("warn")
-                out = renderer.render(vertices, faces, testing._cameras(views), shading, (64, 64))
+                out = renderer.render(
+                    vertices, faces, rendering.cameras_around(views), shading, (64, 64)
+                )
                 loss = out.image.square().sum() + out.coverage.sum()
                 waits.append(sum("synchronizing" in str(each.message) for each in told))
             torch.cuda.set_sync_debug_mode("error")

@@ -96,7 +96,8 @@ def test_the_guides_field(tmp_path):
 
 
 def test_the_guides_encoder(monkeypatch, tmp_path):
-    from styleexp.encoders import vgg, weights
+    from styleexp.encoders import vgg
+    from styleexp.inputs import weights
 
     random = vgg.random_weights((1, 1, 1), 0)
     monkeypatch.setattr(weights, "read", lambda path: random)

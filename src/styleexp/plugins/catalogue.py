@@ -91,8 +91,8 @@ RENDERERS = _named(
 
 
 def _pretrained(config: EncoderConfig, *, device: str | torch.device, seed: int) -> Encoder:
-    from styleexp.encoders import vgg, weights
-    from styleexp.inputs import assets
+    from styleexp.encoders import vgg
+    from styleexp.inputs import assets, weights
 
     return vgg.build(
         config.name,

@@ -21,12 +21,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import torch
 
-from styleexp.renderers import llvm
 from styleexp.renderers.base import (
     Cameras,
     Capabilities,
@@ -35,6 +33,7 @@ from styleexp.renderers.base import (
     Shading,
     one_light_at_a_time,
 )
+from styleexp.renderers.mitsuba_parts import integrator, load_mitsuba, outline_gradient
 from styleexp.renderers.soft_raster.geometry import FaceNormals, unit, vertex_normals
 from styleexp.renderers.soft_raster.raster import facing
 from styleexp.renderers.soft_raster.shading import world_light
@@ -119,7 +118,7 @@ class MitsubaAD(Renderer):
         attached = torch.is_grad_enabled() and vertices.requires_grad
         outlines = sppp > 0 and attached
         points = _seen_by_mitsuba(single, cameras, resolution) if outlines else single[:0]
-        _, dr = _mitsuba()
+        _, dr = load_mitsuba()
 
         @dr.wrap(source="torch", target="drjit")
         def trace(vertices: Any, normals: Any, points: Any) -> Any:
@@ -128,7 +127,9 @@ class MitsubaAD(Renderer):
             if attached:
                 color = dr.replace_grad(color, world.look_attached(sppc))
             if outlines:
-                color = dr.replace_grad(color, color + dr.custom(_outlines(), points, world, sppp))
+                color = dr.replace_grad(
+                    color, color + dr.custom(outline_gradient(), points, world, sppp)
+                )
             return color, seen, depth
 
         color, seen, depth = trace(
@@ -183,7 +184,7 @@ class _World:
 
     def __init__(self, job: _Job, vertices: Any, normals: Any, seed: int) -> None:
         """``vertices`` and ``normals`` are flat (x, y, z, x, ...) and may carry gradients."""
-        mi, dr = _mitsuba()
+        mi, dr = load_mitsuba()
         self.job, self.vertices, self.normals, self.seed = job, vertices, normals, seed
         self.faces = _array(mi.UInt32, job.faces)
         self.front = _array(mi.Bool, job.front)
@@ -203,7 +204,7 @@ class _World:
     def look(self, samples: int) -> tuple[Any, Any, Any]:
         """Colours (two channels) without gradients, and the face (or -1) and depth (or infinity) at
         pixel centres."""
-        _, dr = _mitsuba()
+        _, dr = load_mitsuba()
         parts = []
         with dr.suspend_grad():
             for views in self.portions(samples):
@@ -219,7 +220,7 @@ class _World:
 
     def look_attached(self, samples: int) -> Any:
         """Colours with gradients of shading, but not of visibility."""
-        _, dr = _mitsuba()
+        _, dr = load_mitsuba()
         parts = []
         for views in self.portions(samples):
             with dr.suspend_grad():
@@ -238,7 +239,7 @@ class _World:
 
     def rays(self, views: range, samples: int) -> _Rays:
         """Rays through pixel centres, or through stratified samples of each pixel."""
-        mi, dr = _mitsuba()
+        mi, dr = load_mitsuba()
         height, width = self.job.resolution
         size = height * width * samples
         lane = dr.arange(mi.UInt32, len(views) * size)
@@ -267,7 +268,7 @@ class _World:
 
     def hit(self, rays: _Rays) -> tuple[Any, Any]:
         """First front face beyond the near plane (or -1), and its depth (or infinity)."""
-        mi, dr = _mitsuba()
+        mi, dr = load_mitsuba()
         number = self.job.faces.shape[0]
 
         def go_on(depth: Any, face: Any, active: Any) -> Any:
@@ -290,7 +291,7 @@ class _World:
 
     def color(self, rays: _Rays, face: Any) -> Any:
         """Intensity and coverage of rays that hit these faces."""
-        mi, dr = _mitsuba()
+        mi, dr = load_mitsuba()
         seen = face >= 0
         index = mi.UInt32(dr.maximum(face, 0))
         if self.job.shading.normals == "flat":
@@ -307,13 +308,13 @@ class _World:
 
     def interpolated(self, corners: Any, weights: Any, active: Any) -> Any:
         """Interpolated normal, not normalised."""
-        mi, dr = _mitsuba()
+        mi, dr = load_mitsuba()
         normals = [dr.gather(mi.Vector3f, self.normals, corner, active) for corner in corners]
         return sum(weight * normal for weight, normal in zip(weights, normals, strict=True))
 
     def lit(self, normal: Any, view: Any, seen: Any) -> Any:
         """Apply the shared shading; ``normal`` may have any length."""
-        mi, dr = _mitsuba()
+        mi, dr = load_mitsuba()
         squared = dr.squared_norm(normal)
         scale = dr.select(squared > 0, dr.rsqrt(dr.select(squared > 0, squared, 1)), 0)
         cosine = dr.dot(normal, self.of(mi.Vector3f, self.light, view)) * scale
@@ -322,14 +323,14 @@ class _World:
 
     def mean(self, color: Any, samples: int) -> Any:
         """Mean over each pixel's samples, as a flat array."""
-        _, dr = _mitsuba()
+        _, dr = load_mitsuba()
         if samples > 1:
             color = dr.block_reduce(dr.ReduceOp.Add, color, samples) / samples
         return dr.ravel(color)
 
     def of(self, kind: Any, values: Any, view: Any) -> Any:
         """Gather each view's values."""
-        _, dr = _mitsuba()
+        _, dr = load_mitsuba()
         return dr.gather(kind, values, view)
 
     def outlines(self, view: int, points: Any, samples: int, grad: Any) -> Any:
@@ -338,14 +339,14 @@ class _World:
 
         ``points`` are vertices in the space of Mitsuba's camera; all arrays are flat.
         """
-        mi, dr = _mitsuba()
+        mi, dr = load_mitsuba()
         kept = self.job.front[view].nonzero().view(-1)
         if not kept.numel():
             return dr.zeros(mi.Float, dr.width(points))
         dr.enable_grad(points)
         mesh = _mesh(points, _array(mi.UInt32, self.job.faces[kept]))
-        integrator = _integrator()(self, mesh, view, _array(mi.UInt32, kept.int()), samples)
-        image = integrator.picture(_sensor(self.job, view), self.seed)
+        outlines = integrator()(self, mesh, view, _array(mi.UInt32, kept.int()), samples)
+        image = outlines.picture(_sensor(self.job, view), self.seed)
         if image is not None:
             pair = dr.unravel(mi.Vector2f, grad)
             dr.set_grad(image, mi.TensorXf(dr.ravel(mi.Color3f(pair.x, pair.y, 0)), image.shape))
@@ -367,7 +368,7 @@ def _array(kind: Any, values: Tensor) -> Any:
 
 def _mesh(vertices: Any, faces: Any) -> Any:
     """Make a Mitsuba mesh from flat arrays."""
-    mi, dr = _mitsuba()
+    mi, dr = load_mitsuba()
     mesh = mi.Mesh("mesh", vertex_count=dr.width(vertices) // 3, face_count=dr.width(faces) // 3)
     parameters = mi.traverse(mesh)
     parameters["faces"], parameters["vertex_positions"] = faces, vertices
@@ -377,13 +378,13 @@ def _mesh(vertices: Any, faces: Any) -> Any:
 
 def _divisible(samples: int) -> int:
     """Round up to a number of samples that the sampler can stratify."""
-    mi, _ = _mitsuba()
+    mi, _ = load_mitsuba()
     return mi.load_dict({"type": "multijitter", "sample_count": samples}).sample_count()
 
 
 def _sensor(job: _Job, view: int) -> Any:
     """Mitsuba camera with a box-filtered film."""
-    mi, _ = _mitsuba()
+    mi, _ = load_mitsuba()
     height, width = job.resolution
     film = {
         "type": "hdrfilm",
@@ -424,113 +425,3 @@ def _eyes(cameras: Cameras, like: Tensor) -> Float[Tensor, "views 3"]:
     """World positions of the cameras."""
     rotation, translation = cameras.rotation.to(like), cameras.translation.to(like)
     return -(rotation * translation[:, :, None]).sum(1)
-
-
-def _mitsuba() -> tuple[Any, Any]:
-    """Import ``mitsuba``, set to our variant, and ``drjit``."""
-    mi, dr = _load()
-    if mi.variant() != llvm.VARIANT:
-        mi.set_variant(llvm.VARIANT)
-    return mi, dr
-
-
-@cache
-def _load() -> tuple[Any, Any]:
-    llvm.prepare()
-    import drjit
-    import mitsuba
-
-    mitsuba.set_variant(llvm.VARIANT)
-    drjit.set_thread_count(torch.get_num_threads())
-    return mitsuba, drjit
-
-
-@cache
-def _outlines() -> type:
-    """Class of a custom operation that returns 0 and has the gradient of outlines.
-
-    The views' scenes are created one at a time in the backward pass, so that Dr.Jit's recorded
-    graph doesn't keep them alive.
-    """
-    mi, dr = _mitsuba()
-    from drjit import CustomOp
-
-    class Gradient(CustomOp):
-        def eval(self, points: Any, world: _World, samples: int) -> Any:
-            self.points, self.world, self.samples = points, world, samples
-            height, width = world.job.resolution
-            return dr.zeros(mi.Float, points.shape[0] * height * width * 2)
-
-        def backward(self) -> None:
-            grad, views = self.grad_out(), self.points.shape[0]
-            parts = []
-            for view in range(views):
-                points, own = (_portion(x, view, views) for x in (self.points.array, grad))
-                parts.append(self.world.outlines(view, points, self.samples, own))
-            self.set_grad_in("points", mi.TensorXf(dr.concat(parts), self.points.shape))
-
-    return Gradient
-
-
-def _portion(values: Any, index: int, parts: int) -> Any:
-    """Part ``index`` of ``parts`` equal parts."""
-    mi, dr = _mitsuba()
-    size = dr.width(values) // parts
-    first = dr.opaque(mi.UInt32, index * size)
-    return dr.gather(mi.Float, values, dr.arange(mi.UInt32, size) + first)
-
-
-@cache
-def _integrator() -> type:
-    """Class of our integrator, which can only be defined once Mitsuba's variant is set."""
-    mi, dr = _mitsuba()
-    from mitsuba.ad import ProjectiveDetail
-    from mitsuba.ad.integrators.direct_projective import DirectProjectiveIntegrator
-
-    class Silhouette(ProjectiveDetail):
-        """Outline samples whose mesh is data, not a constant compiled into the kernels."""
-
-        def sample_primarily_visible_silhouette(self, *arguments: Any) -> Any:
-            sample = super().sample_primarily_visible_silhouette(*arguments)
-            sample.shape = dr.opaque(mi.ShapePtr, self.parent.mesh)
-            return sample
-
-    class Outlines(DirectProjectiveIntegrator):
-        """``direct_projective`` for surfaces that emit the shared shading, outlines only."""
-
-        def __init__(self, world: _World, mesh: Any, view: int, numbers: Any, samples: int) -> None:
-            """``numbers`` are the world indices of the mesh's faces."""
-            super().__init__(mi.Properties())
-            self.sppc, self.sppp, self.sppi = 0, samples, 0
-            self.proj_detail = Silhouette(self)
-            self.world, self.mesh, self.numbers = world, mesh, numbers
-            self.view = dr.opaque(mi.UInt32, view)
-            self.scene = mi.load_dict({"type": "scene", "mesh": mesh})
-
-        def picture(self, sensor: Any, seed: int) -> Any:
-            """Image with the gradient of outlines; None if there are none."""
-            edges, _ = self.mesh.precompute_silhouette(mi.ScalarPoint3f(0))
-            if not dr.width(edges):  # the base class treats this as an error
-                return None
-            return self.render_ad(self.scene, sensor, seed, 0, dr.ADMode.Backward)
-
-        def sample_radiance_difference(
-            self, scene: Any, ss: Any, depth: Any, sampler: Any, wavelengths: Any, active: Any
-        ) -> tuple[Any, Any]:
-            hit = scene.ray_intersect_preliminary(ss.spawn_ray(wavelengths), active=active)
-            behind = self.emitted(hit.prim_index, hit.prim_uv, hit.is_valid() & active)
-            difference = self.emitted(ss.prim_index, ss.uv, active) - behind
-            return difference, active & dr.any(difference != 0)
-
-        def emitted(self, index: Any, uv: Any, seen: Any) -> Any:
-            face = dr.gather(mi.UInt32, self.numbers, index, seen)
-            if self.world.job.shading.normals == "flat":
-                normal = dr.gather(mi.Vector3f, self.world.normals, face, seen)
-            else:
-                corners = dr.gather(mi.Vector3u, self.world.faces, face, seen)
-                weights = (1 - uv.x - uv.y, uv.x, uv.y)
-                normal = self.world.interpolated(corners, weights, seen)
-            color = self.world.lit(normal, self.view, seen)
-            return mi.Color3f(color.x, color.y, 0)
-
-    return Outlines

@@ -18,6 +18,7 @@ from styleexp.runs import identity, untrusted
 from styleexp.runs.schema import too_new
 from styleexp.system import locks
 from styleexp.system.errors import UserError
+from styleexp.system.options import flatten
 
 if TYPE_CHECKING:
     from styleexp.runs.jobs import Job
@@ -209,17 +210,6 @@ def final_loss(steps: Sequence[Mapping[str, float]]) -> float | None:
     losses = [step["loss"] for step in steps if "loss" in step]
     last = losses[-max(1, len(losses) // LAST_SHARE) :]
     return sum(last) / len(last) if last else None
-
-
-def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """The values of nested dictionaries by their dotted keys."""
-    flat: dict[str, Any] = {}
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            flat |= flatten(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = value
-    return flat
 
 
 def _read(folder: Path, asked: Sequence[str] | None) -> Run:

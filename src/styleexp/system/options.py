@@ -77,3 +77,14 @@ def _values(options: Any, prefix: str = "") -> Iterator[tuple[str, Any, Mapping[
             yield from _values(value, f"{prefix}{field.name}.")
         else:
             yield prefix + field.name, value, field.metadata
+
+
+def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """The values of nested dictionaries by their dotted keys."""
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            flat |= flatten(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat
