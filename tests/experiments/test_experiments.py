@@ -10,7 +10,7 @@ import pytest
 from omegaconf import OmegaConf
 from PIL import Image
 
-from styleexp.config import schema
+from styleexp.config import checks, schema
 from styleexp.config.compose import compose
 from styleexp.experiments.sweeps import figure, report
 from styleexp.experiments.sweeps.figure import Shown, layout
@@ -77,7 +77,7 @@ def test_every_job_of_every_experiment_is_valid(path):
     methods = set()
     for overrides in jobs:
         made = compose([*overrides, "hydra.mode=RUN"])
-        schema.check(made)
+        checks.check(made)
         methods.add(getattr(made.baseline, "name", "learned"))
     robust = compose([*jobs[0], "method=robust", "hydra.mode=RUN"])
     assert (robust.baseline, robust.source.refine) == (None, "none")

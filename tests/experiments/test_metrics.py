@@ -15,6 +15,7 @@ from styleexp.experiments import metrics
 from styleexp.experiments.metrics import shape, style, truth
 from styleexp.experiments.metrics.board import nearest
 from styleexp.inputs import meshes, shapes
+from styleexp.inputs.style import Style
 from styleexp.method import patches
 from styleexp.method.subject import pattern_unit
 
@@ -39,14 +40,16 @@ def on(source, name, factor=1.0, scale=1.0):
     vertices = frame.apply(source.vertices)
     normals = meshes.vertex_normals(vertices, source.faces)
     config = compose([f"style={name}"]).style
-    unit = scale * pattern_unit(config, source, shapes.make(name))
+    unit = scale * pattern_unit(config, source, Style.of(shapes.make(name)))
     height = factor * truth.wrapped(name, vertices, normals, unit, np.random.default_rng(3))
     return frame.invert(vertices + height[:, None] * normals)
 
 
 def measured(source, name, vertices, judge=None):
     config = compose(["source=torus", f"style={name}"])
-    return metrics.measure(config, source, shapes.make(name), vertices, source.faces, judge)
+    return metrics.measure(
+        config, source, Style.of(shapes.make(name)), vertices, source.faces, judge
+    )
 
 
 # ------------------------------------------------------------------------------------------- style
@@ -81,12 +84,12 @@ def test_the_wrong_scale_is_farther(source, judge, scale):
 
 def test_styles_are_told_apart(source, judge):
     goals = {
-        name: judge.style(compose([f"style={name}"]), shapes.make(name), 1.0)
+        name: judge.style(compose([f"style={name}"]), Style.of(shapes.make(name)), 1.0)
         for name in ("stripe", "bubble", "wave_large")
     }
     for name in goals:
         config = compose([f"style={name}"])
-        unit = pattern_unit(config.style, source, shapes.make(name))
+        unit = pattern_unit(config.style, source, Style.of(shapes.make(name)))
         relief = patches.relief_of_result(source, on(source, name), source.faces, unit)
         looks = judge.looks(config, relief, unit)
         for distance in (
@@ -110,7 +113,7 @@ def test_a_picture_is_judged_as_a_photograph_of_the_relief(judge):
     seen = style.shaded(patches.windows(relief, 1.0, 4).height)
     picture = np.repeat(seen[0].numpy()[..., None], 3, axis=2).astype(np.float32)
     config = compose(["style.path=picture.png", "style.image_tile=0.28"])
-    goal = style.judged_style(picture, config, judge.encoder, 1.0)
+    goal = style.judged_style(Style.of(picture), config, judge.encoder, 1.0)
     near = style.judged(relief, 1.0, judge.encoder, 12)
     other = style.judged(
         patches.relief_of_mesh(shapes.make("stripe", 20_000)), 1.0, judge.encoder, 12

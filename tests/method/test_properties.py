@@ -135,7 +135,7 @@ def test_a_rotation_changes_no_measure_of_the_source(torus, style, tmp_path):
 def test_a_pictures_encoding_does_not_matter(torus, tmp_path):
     from PIL import Image
 
-    from tests.helpers.corpus import pixels
+    from tests.helpers.corpus.writers import pixels
 
     source = save(tmp_path / "a.obj", torus.vertices, torus.faces)
     results = []

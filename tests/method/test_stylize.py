@@ -189,7 +189,7 @@ def test_image_style_runs_and_contrast_sets_the_relief(tmp_path):
         assert np.abs(result.displacement).max() > 0
 
 
-@pytest.mark.parametrize("mode", ["image", "zoom", "surface"])
+@pytest.mark.parametrize("mode", ["image", "surface"])
 def test_every_kind_of_local_view_runs(mode):
     result, _ = run("source=torus", "style=rail", f"views.local.mode={mode}")
     assert np.abs(result.displacement).max() > 0
