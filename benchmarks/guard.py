@@ -49,9 +49,9 @@ def least(run, repeats):
 
 RENDER = """
 from styleexp.inputs import shapes
+from styleexp.method.views import orbit
 from styleexp.renderers.base import Shading
 from styleexp.renderers.soft_raster import SoftRaster
-from styleexp.method.views import orbit
 mesh = shapes.make("bubble", {faces} // 2 + 2)
 points = torch.from_numpy(mesh.vertices).float()
 points = (points / points.norm(dim=1).max()).requires_grad_()
@@ -67,10 +67,46 @@ least(run, 5)
 """
 
 ENCODER = """
-from styleexp.config.schema import LossConfig
-from styleexp.encoders import load_encoder
-from styleexp.method.losses import StyleLoss
+from styleexp.method.losses import GramLoss
+from styleexp.method.options import LossConfig
 from styleexp.method.viewer import Images
+from styleexp.plugins import load_encoder
+loss = GramLoss(LossConfig(), load_encoder("vgg19_random"))
+seen = Images(torch.rand(2, 250, 250, 3, requires_grad=True), torch.ones(2, 250, 250))
+
+def run():
+    sum(gram.square().sum() for gram in loss.describe(seen)).backward()
+
+least(run, 5)
+"""
+
+FIELD = """
+from styleexp.method.fields import FourierMLP
+from styleexp.method.options import FieldConfig
+field = FourierMLP(FieldConfig(), torch.Generator().manual_seed(0), 3.0, 0.1)
+points = torch.rand(20000, 3)
+least(lambda: field(points, precision=torch.bfloat16).sum().backward(), 5)
+"""
+
+STEP = """
+from styleexp.config import build
+from styleexp.config.compose import compose
+config = compose(["source=torus", "style=bubble", "encoder=vgg19_random", "profile=fast",
+                  "method=robust", "loss.bank_views=2", "threads=1"])
+method, scene = build.prepare(config)
+steps = method.optimise(scene, method.start(scene))
+least(lambda: next(steps), 4)
+"""
+
+BEFORE = {
+    "render": RENDER.replace("styleexp.inputs import", "styleexp import").replace(
+        "styleexp.method.views", "styleexp.views"
+    ),
+    "encoder": """
+from styleexp.config import LossConfig
+from styleexp.encoders import load_encoder
+from styleexp.losses import StyleLoss
+from styleexp.viewer import Images
 loss = StyleLoss(LossConfig(), load_encoder("vgg19_random"))
 seen = Images(torch.rand(2, 250, 250, 3, requires_grad=True), torch.ones(2, 250, 250))
 
@@ -78,26 +114,34 @@ def run():
     sum(gram.square().sum() for gram in loss.grams(seen)).backward()
 
 least(run, 5)
-"""
-
-FIELD = """
-from styleexp.config.schema import FieldConfig
-from styleexp.method.fields import DisplacementField
+""",
+    "field": """
+from styleexp.config import FieldConfig
+from styleexp.fields import DisplacementField
 field = DisplacementField(FieldConfig(), torch.Generator().manual_seed(0), 3.0, 0.1)
 points = torch.rand(20000, 3)
 least(lambda: field(field.encode(points), torch.bfloat16).sum().backward(), 5)
-"""
-
-STEP = """
-from styleexp.method import baselines
-from styleexp.config.compose import compose
+""",
+    "step": """
+from styleexp import baselines
+from styleexp.compose import compose
 config = compose(["source=torus", "style=bubble", "encoder=vgg19_random", "profile=fast",
                   "method=robust", "loss.bank_views=2", "threads=1"])
 method = baselines.method(config)
 scene = method.prepare(config)
 steps = method.optimise(scene, method.start(scene))
 least(lambda: next(steps), 4)
-"""
+""",
+}
+"""The same tasks in a tree from before the modules were grouped into packages."""
+
+
+def either(now: str, before: str) -> str:
+    """A task in a tree of today, or of before."""
+    tried = f"exec({now!r} if grouped else {before!r})"
+    grouped = "import importlib.util\ngrouped = importlib.util.find_spec('styleexp.method')\n"
+    return COMMON + grouped + tried
+
 
 HELP = """
 import contextlib, io, sys, time
@@ -117,11 +161,14 @@ print(time.process_time())
 WORK = {
     "import styleexp": IMPORT,
     "styleexp --help": HELP,
-    "render, 20k faces": COMMON + RENDER.replace("{faces}", "20000"),
-    "render, 80k faces": COMMON + RENDER.replace("{faces}", "80000"),
-    "encoder and Grams": COMMON + ENCODER,
-    "field, 20k vertices": COMMON + FIELD,
-    "a whole step": COMMON + STEP,
+    "encoder and Grams": either(ENCODER, BEFORE["encoder"]),
+    "field, 20k vertices": either(FIELD, BEFORE["field"]),
+    "a whole step": either(STEP, BEFORE["step"]),
+} | {
+    f"render, {faces} faces": either(
+        RENDER.replace("{faces}", faces), BEFORE["render"].replace("{faces}", faces)
+    )
+    for faces in ("20000", "80000")
 }
 
 

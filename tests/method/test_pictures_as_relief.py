@@ -12,8 +12,8 @@ import styleexp
 from styleexp.config import build, sources
 from styleexp.config.compose import compose
 from styleexp.method import pictures
-from styleexp.method.height_maps import picture_side
 from styleexp.method.options import StyleConfig
+from styleexp.method.pictures import picture_side
 from styleexp.system.errors import UserError
 
 MAP = ("method=displacement_map", "source.refine=none")

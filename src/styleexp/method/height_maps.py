@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from torch import Tensor
 
-    from styleexp.method.options import StyleConfig
     from styleexp.method.subject import Subject
 
 AXES = ((2, 1), (0, 2), (0, 1))
@@ -86,7 +85,7 @@ def height_map(subject: Subject, patch: float) -> HeightMap:
     heights = subject.heights
     if heights is not None:
         height = heights.height.to(device)
-        side = picture_side(subject.settings.style, subject.unit)
+        side = pictures.picture_side(subject.settings.style, subject.unit)
     else:
         assert style.mesh is not None
         height = torch.from_numpy(mesh_patch(style.mesh, patch)).to(device)
@@ -101,11 +100,6 @@ def height_map(subject: Subject, patch: float) -> HeightMap:
     else:
         half = max(half_range(fit.cpu().numpy().ravel()), 1e-6)
     return HeightMap((fit - fit.mean()) / half, side)
-
-
-def picture_side(config: StyleConfig, unit: float) -> float:
-    """Length of a style image's longer side on the result, in radii of the normalised source."""
-    return unit * config.image_tile * math.sqrt(4 * math.pi)
 
 
 def mesh_patch(style: meshes.Mesh, radius: float) -> Float[np.ndarray, "side side"]:

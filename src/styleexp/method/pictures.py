@@ -6,6 +6,7 @@ the image's longer side.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -163,3 +164,8 @@ def resized(
     factor = longer_side / max(picture.shape)
     shape = [max(8, round(side * factor)) for side in picture.shape]
     return functional.interpolate(picture[None, None], shape, mode="bilinear", antialias=True)[0, 0]
+
+
+def picture_side(config: StyleConfig, unit: float) -> float:
+    """Length of a style image's longer side on the result, in radii of the normalised source."""
+    return unit * config.image_tile * math.sqrt(4 * math.pi)

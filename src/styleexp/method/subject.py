@@ -12,7 +12,7 @@ import torch
 from styleexp.inputs import meshes
 from styleexp.inputs.images import is_normal_map
 from styleexp.inputs.style import Style
-from styleexp.method import height_maps, masks, pictures
+from styleexp.method import masks, pictures
 from styleexp.method.pictures import Heights
 from styleexp.method.refinement import refined
 from styleexp.method.relief import half_range, mesh_frequency, mesh_relief, picture_frequency
@@ -119,7 +119,7 @@ def measure(
         if example is not None and settings.field.sigma is None:
             sigma = min(max(example.frequency, 1.0), 10.0)
     if heights is not None and heights.in_proportion:
-        side = height_maps.picture_side(settings.style, unit)
+        side = pictures.picture_side(settings.style, unit)
         height = pictures.spread(heights.height) * side / size
         bound = BOUND_MARGIN * height if settings.field.bound is None else bound
     given_size = 1.0 if settings.field.unit == "source" else size
