@@ -52,8 +52,8 @@ def stylize(source: MeshLike, style: MeshLike | np.ndarray, *overrides: str) -> 
     """
     config, given = configured(source, style, overrides)
     with sources.given(**given), process.undisturbed(config.threads, config.optim.seed):
-        if (told := unread.note([config], overrides)) is not None:
-            warnings.warn(told, stacklevel=2)
+        if (note := unread.note([config], overrides)) is not None:
+            warnings.warn(note, stacklevel=2)
         method, scene = build.prepare(config)
         for note in (*scene.subject.notes, *scene.notes):
             warnings.warn(note, stacklevel=2)

@@ -68,8 +68,8 @@ def bake(folder: Path, size: int, kind: str, out: Path | None = None) -> list[Pa
         )
     target = out or folder / "bake"
     target.mkdir(parents=True, exist_ok=True)
-    told = {"run": str(folder), "source": source.name, **baking.write(maps, target, kind)}
-    atomic.write(target / "bake.json", atomic.text(json.dumps(told, indent=2) + "\n"))
+    record = {"run": str(folder), "source": source.name, **baking.write(maps, target, kind)}
+    atomic.write(target / "bake.json", atomic.text(json.dumps(record, indent=2) + "\n"))
     return [target / name for name in (f"height.{kind}", f"normal.{kind}", "bake.json")]
 
 

@@ -124,14 +124,14 @@ def _render(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _line(row: dict[str, Any]) -> str:
-    told = (
+    line = (
         f"{row['faces']} faces, {row['views']} views, {row['resolution']} px, {row['device']}: "
         f"{row['ours_ms']:.0f} ms, CPU {row['ours_cpu_ms']:.0f}"
     )
     for peer in row.get("peers", [row] if "peer" in row else []):
-        told += f"; {peer['peer']} {peer['peer_ms']:.0f} ms, CPU {peer['peer_cpu_ms']:.0f}"
-        told += f", ratio {peer['ratio']:.2f}, by CPU time {peer['ratio_cpu']:.2f}"
-    return told
+        line += f"; {peer['peer']} {peer['peer_ms']:.0f} ms, CPU {peer['peer_cpu_ms']:.0f}"
+        line += f", ratio {peer['ratio']:.2f}, by CPU time {peer['ratio_cpu']:.2f}"
+    return line
 
 
 def _step(options: argparse.Namespace) -> dict[str, Any]:

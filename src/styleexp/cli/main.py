@@ -148,8 +148,8 @@ def _job(config: DictConfig) -> float | None:
         folder = Path(runtime.runtime.output_dir)
         # Keep Hydra's grammar: resolving would lose an escaped "${" in a file's name.
         given: Any = OmegaConf.to_container(runtime.overrides.task, resolve=False)
-        if not numbered and (told := unread.note([typed], given)):  # for sweeps, see `sweeps.claim`
-            print(f"note: {told}")
+        if not numbered and (note := unread.note([typed], given)):  # for sweeps, see `sweeps.claim`
+            print(f"note: {note}")
         with chdir(runtime.runtime.cwd):  # resolve typed paths despite hydra.job.chdir
             code = run(typed, folder, given, again=not numbered)
     except UserError as error:

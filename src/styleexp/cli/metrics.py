@@ -150,7 +150,7 @@ def _truth(options: argparse.Namespace) -> dict[str, Any]:
     if judge is None:
         raise UserError("--judge none: the truth board tests a judge; name an encoder.")
 
-    def told(what: str) -> None:
+    def report(what: str) -> None:
         print(what, file=sys.stderr, flush=True)
 
     styles, candidates = list(shapes.RELIEFS), truth.CANDIDATES
@@ -164,9 +164,9 @@ def _truth(options: argparse.Namespace) -> dict[str, Any]:
                     f"--pictures: '{name}' is a mesh; omit the option to test all meshes."
                 )
             pictures[name] = found.picture
-        board = truth.measure_pictures(sources, pictures, judge.name, options.windows, told)
+        board = truth.measure_pictures(sources, pictures, judge.name, options.windows, report)
     else:
-        board = truth.measure_board(sources, judge.name, options.windows, told)
+        board = truth.measure_board(sources, judge.name, options.windows, report)
     verdicts = truth.judge_metrics(board, candidates)
     return {
         "rank1": {name: verdict["rank1"] for name, verdict in verdicts.items()},

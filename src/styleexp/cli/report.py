@@ -40,15 +40,15 @@ def report(given: list[str]) -> list[Path]:
         from styleexp.experiments.reports import notebooks
 
         pages, left_out = notebooks.execute(options.folder, options.notebooks)
-        for told in left_out:
-            print(f"styleexp-report: {told}", file=sys.stderr)
+        for note in left_out:
+            print(f"styleexp-report: {note}", file=sys.stderr)
         return pages
     from styleexp.experiments.reports import page, sweep_page
     from styleexp.runs import finding
 
     if finding.is_run(options.folder):
         written = page.rewrite(
-            options.folder, lambda told: print(f"styleexp-report: note: {told}", file=sys.stderr)
+            options.folder, lambda note: print(f"styleexp-report: note: {note}", file=sys.stderr)
         )
     else:
         written = sweep_page.write(options.folder, not options.no_run_pages)
@@ -66,8 +66,8 @@ def study(given: list[str]) -> list[Path]:
         from styleexp.experiments.reports import study_results
 
         found = study_results.read(options.analyse)
-        for told in found.left_out:
-            print(f"styleexp-report: {told}", file=sys.stderr)
+        for note in found.left_out:
+            print(f"styleexp-report: {note}", file=sys.stderr)
         return study_results.analyse(found, options.out or options.analyse[0].parent)
     if options.folder is None:
         raise UserError(

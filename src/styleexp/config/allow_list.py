@@ -44,8 +44,8 @@ def load(compose: Callable[[], Any]) -> Any:
     except (HydraException, OmegaConfBaseException, UserError):
         raise
     except Exception as error:
-        told = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
-        raise UserError(f"the overrides can't be understood: {told}.") from error
+        reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+        raise UserError(f"the overrides can't be understood: {reason}.") from error
     check(config)
     return config
 

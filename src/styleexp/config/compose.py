@@ -116,9 +116,9 @@ def recorded(config: Any) -> schema.Config:
     try:
         return typed(OmegaConf.create(words.literal(config)))
     except (OmegaConfBaseException, AssertionError, AttributeError, TypeError, ValueError) as error:
-        told = (str(error).splitlines() or [type(error).__name__])[0]
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise UserError(
-            f"the run's record is not a valid configuration for this version ({told}): use the "
+            f"the run's record is not a valid configuration for this version ({reason}): use the "
             "version of styleexp that wrote it."
         ) from error
 
@@ -222,8 +222,8 @@ def _run_name(source: Any, style: Any) -> str:
 def _header(broken: Sequence[str]) -> str:
     if not broken:
         return HELP_HEADER
-    told = re.sub(r"[^\w.:=, -]", "?", ", ".join(broken))  # the header is a template
-    return f"{HELP_HEADER}\nThese plugins can't be used (see styleexp-plugins): {told}\n"
+    names = re.sub(r"[^\w.:=, -]", "?", ", ".join(broken))  # the header is a template
+    return f"{HELP_HEADER}\nThese plugins can't be used (see styleexp-plugins): {names}\n"
 
 
 HELP_HEADER = """\

@@ -42,11 +42,11 @@ def note(configs: Iterable[Config], given: Sequence[str]) -> str | None:
         idle = [each for each in idle if _is_unread(each, read)]
     if not specs or not idle:
         return None
-    told = f"{', '.join(idle)} {'has' if len(idle) == 1 else 'have'} no effect on the result"
-    told += f" with method={' or '.join(specs)}"
+    text = f"{', '.join(idle)} {'has' if len(idle) == 1 else 'have'} no effect on the result"
+    text += f" with method={' or '.join(specs)}"
     if any(_covers(key, "optim.steps") for spec in specs.values() for key in spec.reads or ()):
-        return f"{told}."
-    return f"{told}, which neither renders nor learns: add method=robust to learn."
+        return f"{text}."
+    return f"{text}, which neither renders nor learns: add method=robust to learn."
 
 
 def _baseline(config: Config) -> Spec | None:

@@ -70,7 +70,7 @@ def load(path: str, device: str | torch.device) -> ClipEncoder:
     logging.set_verbosity_error()  # silence warnings about the unused text tower
     logging.disable_progress_bar()
     try:
-        tower, told = CLIPVisionModelWithProjection.from_pretrained(
+        tower, loading = CLIPVisionModelWithProjection.from_pretrained(
             path,
             local_files_only=True,
             use_safetensors=True,
@@ -86,8 +86,8 @@ def load(path: str, device: str | torch.device) -> ClipEncoder:
         logging.set_verbosity(shown)
         if bars:
             logging.enable_progress_bar()
-    if told["missing_keys"] or told["mismatched_keys"]:
-        lacks = sorted(map(str, {*told["missing_keys"], *told["mismatched_keys"]}))
+    if loading["missing_keys"] or loading["mismatched_keys"]:
+        lacks = sorted(map(str, {*loading["missing_keys"], *loading["mismatched_keys"]}))
         raise UserError(
             f"encoder.weights={path} lacks {len(lacks)} of CLIP's image weights, such as "
             f"{lacks[0]}: give {WANTED}."

@@ -151,8 +151,8 @@ def from_array(picture: np.ndarray) -> Float[np.ndarray, "height width 3"]:
 
 def _one_of(frames: int, path: Path) -> None:
     if frames > 1:
-        told = f"'{path}' has {frames} frames or pages: the first one"
-        warnings.warn(f"{told} is used.", stacklevel=3)
+        text = f"'{path}' has {frames} frames or pages: the first one"
+        warnings.warn(f"{text} is used.", stacklevel=3)
 
 
 def _deep(path: Path) -> bool:

@@ -87,11 +87,11 @@ def _read(path: Path, encoder: Encoder) -> tuple[Statistics, Statistics] | None:
 
     try:
         with safe_open(path, framework="pt") as opened:
-            told = opened.metadata()["digest"]
+            digest = opened.metadata()["digest"]
             tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
     except (OSError, SafetensorError, KeyError, TypeError):
         return None
-    if digests.of(tensors) != told:
+    if digests.of(tensors) != digest:
         return None
     with suppress(OSError):  # read-only cache
         os.utime(path)

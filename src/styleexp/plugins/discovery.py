@@ -99,10 +99,10 @@ class Choice:
         missing = [name for name in self.loaded.requires if not _importable(name)]
         if not missing:
             return None
-        told = f"needs {' and '.join(missing)}"
+        reason = f"needs {' and '.join(missing)}"
         if self.loaded.extra and self.distribution:
-            told += f": pip install '{self.distribution}[{self.loaded.extra}]'"
-        return told
+            reason += f": pip install '{self.distribution}[{self.loaded.extra}]'"
+        return reason
 
 
 def everything() -> tuple[Choice, ...]:
@@ -176,7 +176,7 @@ def build(kind: str, options: Any, **given: Any) -> Any:
         if choice.origin == OWN:
             raise
         raise UserError(
-            f"the {kind} '{name}' of {choice.origin} failed: {_told(error)} (debug=true shows the "
+            f"the {kind} '{name}' of {choice.origin} failed: {_on_one_line(error)} (debug=true shows the "
             "traceback)."
         ) from error
 
@@ -217,11 +217,11 @@ def _everything(variable: str) -> tuple[Choice, ...]:
         key = plugin.kind, plugin.name
         origins = [each.origin for each in plugins if (each.kind, each.name) == key]
         if key in owners:
-            told = f"{owners[key]} has that name already, so {plugin.origin} can't use it"
-            plugin = replace(plugin, fault=told, error=None, ceded=True)
+            fault = f"{owners[key]} has that name already, so {plugin.origin} can't use it"
+            plugin = replace(plugin, fault=fault, error=None, ceded=True)
         elif len(origins) > 1:
-            told = f"{' and '.join(origins)} have the same name: keep only one of them"
-            plugin = replace(plugin, fault=told, error=None)
+            fault = f"{' and '.join(origins)} have the same name: keep only one of them"
+            plugin = replace(plugin, fault=fault, error=None)
         found.append(plugin)
     return tuple(found)
 
@@ -244,8 +244,8 @@ def _installed() -> Iterator[Choice]:
             seen.add(name)
             points = [p for p in distribution.entry_points if p.group.startswith("styleexp.")]
         except Exception as error:
-            told = f"its entry points can't be read: {_told(error)}"
-            yield Choice("?", name or "?", name or "?", version, fault=told, error=error)
+            fault = f"its entry points can't be read: {_on_one_line(error)}"
+            yield Choice("?", name or "?", name or "?", version, fault=fault, error=error)
             continue
         for point in points:
             origin = f"{name} ({point.value})"
@@ -253,8 +253,10 @@ def _installed() -> Iterator[Choice]:
             if kinds:
                 yield _load(kinds[0], point.name, origin, version, name, point.load)
             else:
-                told = str(unknown_name("group", point.group, (k.group for k in KINDS.values())))
-                yield Choice(point.group, point.name, origin, version, name, fault=told.rstrip("."))
+                fault = str(unknown_name("group", point.group, (k.group for k in KINDS.values())))
+                yield Choice(
+                    point.group, point.name, origin, version, name, fault=fault.rstrip(".")
+                )
 
 
 def _named_by(variable: str) -> Iterator[Choice]:
@@ -266,8 +268,8 @@ def _named_by(variable: str) -> Iterator[Choice]:
         module, _, attribute = value.partition(":")
         origin = f"{VARIABLE} ({item})"
         if kind not in KINDS or not module or not attribute:
-            told = f"'{item}' is not KIND=MODULE:SPEC with KIND one of {', '.join(KINDS)}"
-            choice = Choice(kind if kind in KINDS else "?", item, origin, fault=told)
+            fault = f"'{item}' is not KIND=MODULE:SPEC with KIND one of {', '.join(KINDS)}"
+            choice = Choice(kind if kind in KINDS else "?", item, origin, fault=fault)
         else:
             choice = _load(kind, None, origin, None, None, partial(_attribute, module, attribute))
         if choice.fault:
@@ -297,7 +299,9 @@ def _load(
             spec = load()
             fault = _fault(kind, name, spec)
     except (Exception, SystemExit) as error:
-        return replace(choice, fault=f"{origin} can't be loaded: {_told(error)}", error=error)
+        return replace(
+            choice, fault=f"{origin} can't be loaded: {_on_one_line(error)}", error=error
+        )
     if fault:
         return replace(choice, fault=f"{origin} {fault}")
     assert isinstance(spec, Spec)
@@ -332,7 +336,7 @@ def _importable(name: str) -> bool:
         return False
 
 
-def _told(error: BaseException) -> str:
+def _on_one_line(error: BaseException) -> str:
     """The error on one line."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return f"{type(error).__name__}: {': '.join(lines)}" if lines else type(error).__name__

@@ -71,10 +71,10 @@ def run(config: Config, points: int) -> list[Point]:
     def note() -> None:
         result = method.finish(scene, state)
         source, style = result.subject.source, result.subject.style
-        told = metrics.measure(config, source, style, result.vertices, source.faces, judge)
+        values = metrics.measure(config, source, style, result.vertices, source.faces, judge)
         kept = ("style_distance", "relief_distance", "silhouette_iou")
         times = {"step": state.step, "seconds": seconds, "cpu_seconds": cpu_seconds}
-        measured.append(times | {k: told[k] for k in kept if k in told})
+        measured.append(times | {k: values[k] for k in kept if k in values})
 
     note()
     wall, cpu = time.perf_counter(), time.process_time()

@@ -99,7 +99,7 @@ def measure(
         take(2)
         peak = peak_memory_mb(lambda: take(steps))
     rows = rows[2:]
-    return _told(rows, scene, calls, config) | {"peak_memory_mb": peak}
+    return _summary(rows, scene, calls, config) | {"peak_memory_mb": peak}
 
 
 def _log(folder: RunFolder, step: Any, state: Any, config: Any) -> None:
@@ -128,7 +128,7 @@ def _note_calls(encoder: Any) -> list[Call]:
     return calls
 
 
-def _told(rows: list[Any], scene: PaperScene, calls: list[Call], config: Any) -> dict[str, Any]:
+def _summary(rows: list[Any], scene: PaperScene, calls: list[Call], config: Any) -> dict[str, Any]:
     names = [name for name in (*PARTS, OTHER) if any(name in row for row in rows)]
     names += sorted({name for row in rows for name in row} - set(names))
     wall, cpu = (
@@ -139,7 +139,7 @@ def _told(rows: list[Any], scene: PaperScene, calls: list[Call], config: Any) ->
         1e3 * median(sum(each[i] for each in row.values()) for row in rows) for i in (0, 1)
     )
     encoder = scene.encoder
-    told: dict[str, Any] = {
+    summary: dict[str, Any] = {
         "step_ms": step_wall,
         "step_cpu_ms": step_cpu,
         "parts_ms": wall,
@@ -152,13 +152,13 @@ def _told(rows: list[Any], scene: PaperScene, calls: list[Call], config: Any) ->
     if isinstance(encoder, VGG) and calls and scene.subject.surface.vertices.device.type == "cpu":
         floor = encoder_floor(encoder, calls)
         spent = cpu["encoder"] + cpu.get(f"encoder{BACKWARD}", 0.0)
-        told |= {
+        summary |= {
             "encoder_over_floor": spent / (1e3 * floor.seconds),
             "encoder_over_convolutions": spent / (1e3 * floor.convolutions),
             "encoder_gflop": floor.flops / 1e9,
             "gflop_per_cpu_second": {k: v / 1e9 for k, v in floor.rates.items()},
         }
-    return told | {
+    return summary | {
         "vertices": len(scene.subject.surface.vertices),
         "faces": len(scene.subject.surface.faces),
         "views": [list(shape[:3:2]) for shape, _, _ in calls],

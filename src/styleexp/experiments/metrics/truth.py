@@ -217,7 +217,7 @@ def _variants(
 
 
 def measure_board(
-    sources: list[meshes.Mesh], judge: str, count: int, told: Callable[[str], None]
+    sources: list[meshes.Mesh], judge: str, count: int, report: Callable[[str], None]
 ) -> Board:
     """Apply every style to every source, with distractors, and measure with the encoders."""
     encoder = load_encoder(judge)
@@ -254,7 +254,7 @@ def measure_board(
                 vertices = source.vertices + moved[:, None] * normals
                 relief = relief_of_result(source, vertices, source.faces, unit)
                 board.cases[given.name, name, what] = sample(relief, unit, vertices, source.faces)
-            told(f"{given.name}, {name}")
+            report(f"{given.name}, {name}")
     return board
 
 
@@ -263,7 +263,7 @@ def measure_pictures(
     pictures: dict[str, Float[np.ndarray, "height width 3"]],
     judge: str,
     count: int,
-    told: Callable[[str], None],
+    report: Callable[[str], None],
 ) -> Board:
     """Apply every image to every source, with distractors; see `measure_board`."""
     encoder = load_encoder(judge)
@@ -285,7 +285,7 @@ def measure_pictures(
                 relief = relief_of_result(source, vertices, source.faces, unit)
                 looks = judged(relief, unit, encoder, count)
                 board.cases[given.name, name, what] = Sample(looks, [], [])
-            told(f"{given.name}, {name}")
+            report(f"{given.name}, {name}")
     return board
 
 

@@ -117,7 +117,7 @@ def read_gltf(data: bytes, path: Path) -> tuple[np.ndarray, Carrier, list[str]]:
     if not reader.blocks:
         nothing = np.zeros((0, 3), dtype=np.int64)
         return reader.loose, Carrier(nothing, nothing, nothing), notes
-    notes += reader.told()
+    notes += reader.left_out()
     notes += _stale(tree, reader.blocks)
     return reader.points(), reader.carrier(materials), notes
 
@@ -263,7 +263,7 @@ class _Reader:
                 moved = moved + float(weight) * self._column(target["POSITION"], count, 3)
         return moved
 
-    def told(self) -> list[str]:
+    def left_out(self) -> list[str]:
         """Notes on everything that isn't part of the surface."""
         notes = []
         if self.odd:

@@ -65,9 +65,9 @@ def from_arrays(
             raise TypeError("complex numbers")
         points = points.astype(np.float64)
     except (TypeError, ValueError, RuntimeError) as error:
-        told = " ".join(str(error).split())[:100].rstrip(".")
+        reason = " ".join(str(error).split())[:100].rstrip(".")
         raise UserError(
-            f"is not a pair of numeric arrays ({told}): give (vertices, faces)."
+            f"is not a pair of numeric arrays ({reason}): give (vertices, faces)."
         ) from None
     if points.ndim != 2 or points.shape[1] != 3:
         raise UserError(f"has vertices of shape {points.shape}: give (vertices, 3).")

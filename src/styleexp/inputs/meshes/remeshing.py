@@ -31,8 +31,8 @@ def remesh(mesh: Mesh, target_vertices: int) -> Mesh:
     result = None if reason else _botsch(points, mesh.faces, target_vertices)
     if result is None:
         reason = reason or "the remesher failed"
-        if "manifold" in reason and (told := torn(mesh.vertices, mesh.faces)):
-            reason += f"; {told}"
+        if "manifold" in reason and (note := torn(mesh.vertices, mesh.faces)):
+            reason += f"; {note}"
         vertices, faces, times = points, mesh.faces, 0
         while len(vertices) < target_vertices:
             vertices, faces = trimesh.remesh.subdivide(vertices, faces)

@@ -79,8 +79,8 @@ def weld(
         notes.append(f"merged {number} within {reach:.2g} of others on open edges")
     vertices = points[first]
     file_faces = rows[carrier.corners]
-    if told := torn(vertices, file_faces):
-        notes.append(told)
+    if note := torn(vertices, file_faces):
+        notes.append(note)
 
     unit = (vertices - vertices.mean(axis=0)) / extent
     degenerate = int((face_areas(unit, file_faces) <= 1e-20).sum())

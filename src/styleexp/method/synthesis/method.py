@@ -83,7 +83,7 @@ def relief(
     directed = pattern.directed > DIRECTED
     ahead = directions(subject, sheet, directed)
     levels = levels_of(pattern, sheet.edge / subject.unit)
-    tell(told(subject, pattern, directed, levels))
+    tell(summary(subject, pattern, directed, levels))
 
     height = torch.zeros(len(sheet.vertices))
     total = sum(level.rounds for level in levels)
@@ -137,7 +137,7 @@ def levels_of(pattern: Pattern, edge: float) -> list[Level]:
     return [Level(*each) for each in zip([coarsest, *carried], ROUNDS, strict=False)]
 
 
-def told(subject: Subject, pattern: Pattern, directed: bool, levels: list[Level]) -> str:
+def summary(subject: Subject, pattern: Pattern, directed: bool, levels: list[Level]) -> str:
     """One-line summary of the style's measurements."""
     name = subject.style.name
     return (

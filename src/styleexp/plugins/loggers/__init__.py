@@ -78,9 +78,9 @@ class Loggers:
                 tell(logger)
             except Exception as error:
                 del self._loggers[name]
-                told = " ".join(str(error).split()) or type(error).__name__
+                reason = " ".join(str(error).split()) or type(error).__name__
                 warnings.warn(
-                    f"the logger '{name}' failed ({told}); the run continues, and metrics.jsonl "
+                    f"the logger '{name}' failed ({reason}); the run continues, and metrics.jsonl "
                     "is complete.",
                     stacklevel=2,
                 )

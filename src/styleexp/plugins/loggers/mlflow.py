@@ -57,9 +57,9 @@ class MLflow:
             else:
                 self._describe(folder, record)
         except (MlflowException, SQLAlchemyError, OSError) as error:
-            told = " ".join(str(error).split())[:200]
+            reason = " ".join(str(error).split())[:200]
             raise UserError(
-                f"the MLflow store '{uri}' can't be used ({told}): choose another one with "
+                f"the MLflow store '{uri}' can't be used ({reason}): choose another one with "
                 "logger.mlflow.uri=URI."
             ) from error
         atomic.write(kept, atomic.text(json.dumps({"uri": uri, "run_id": self._run}) + "\n"))

@@ -29,8 +29,8 @@ class TensorBoard:
         purge = step + 1 if step else None
         self._writer = SummaryWriter(str(folder / FOLDER), purge_step=purge, flush_secs=10)
         if not step:
-            told = json.dumps(dict(record), indent=2, default=str)
-            self._writer.add_text("run", f"```json\n{told}\n```", 0)
+            text = json.dumps(dict(record), indent=2, default=str)
+            self._writer.add_text("run", f"```json\n{text}\n```", 0)
 
     def log(self, values: Mapping[str, float], step: int) -> None:
         """Log one scalar per number."""
