@@ -46,9 +46,7 @@ def explain(error: BaseException) -> str:
         hint = f"did you mean {' or '.join(full)}? " if full else ""
         return f"there is no key '{key[1]}': {hint}'styleexp --help' lists the keys."
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    informative = [
-        x for x in lines if not x.startswith(("full_key", "object_type", "reference_type"))
-    ]
+    kept = [x for x in lines if not x.startswith(("full_key", "object_type", "reference_type"))]
     return ": ".join(dict.fromkeys(informative)) or type(error).__name__
 
 

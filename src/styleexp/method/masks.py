@@ -90,9 +90,9 @@ def weights(config: StyleConfig, source: Mesh) -> Float[np.ndarray, " vertices"]
     for term in parsed(config.mask):
         factor = factor * _values(term, source)
     if not factor.any():
-        selection = ", ".join(term.text for term in parsed(config.mask))
+        terms = ", ".join(term.text for term in parsed(config.mask))
         raise UserError(
-            f"style.mask={selection} selects no vertex of the source '{source.name}': give a mask that "
+            f"style.mask={terms} selects no vertex of the source '{source.name}': give a mask that "
             "is above 0 somewhere."
         )
     return softened(source, factor, config.falloff)

@@ -176,7 +176,7 @@ def build(kind: str, options: Any, **given: Any) -> Any:
         if choice.origin == OWN:
             raise
         raise UserError(
-            f"the {kind} '{name}' of {choice.origin} failed: {_on_one_line(error)} (debug=true shows the "
+            f"the {kind} '{name}' of {choice.origin} failed: {_one_line(error)} (debug=true shows the "
             "traceback)."
         ) from error
 
@@ -244,7 +244,7 @@ def _installed() -> Iterator[Choice]:
             seen.add(name)
             points = [p for p in distribution.entry_points if p.group.startswith("styleexp.")]
         except Exception as error:
-            fault = f"its entry points can't be read: {_on_one_line(error)}"
+            fault = f"its entry points can't be read: {_one_line(error)}"
             yield Choice("?", name or "?", name or "?", version, fault=fault, error=error)
             continue
         for point in points:
@@ -299,9 +299,7 @@ def _load(
             spec = load()
             fault = _fault(kind, name, spec)
     except (Exception, SystemExit) as error:
-        return replace(
-            choice, fault=f"{origin} can't be loaded: {_on_one_line(error)}", error=error
-        )
+        return replace(choice, fault=f"{origin} can't be loaded: {_one_line(error)}", error=error)
     if fault:
         return replace(choice, fault=f"{origin} {fault}")
     assert isinstance(spec, Spec)
@@ -336,7 +334,7 @@ def _importable(name: str) -> bool:
         return False
 
 
-def _on_one_line(error: BaseException) -> str:
+def _one_line(error: BaseException) -> str:
     """The error on one line."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return f"{type(error).__name__}: {': '.join(lines)}" if lines else type(error).__name__
