@@ -89,7 +89,7 @@ def parts(scene: PaperScene, moved: torch.Tensor) -> dict[str, dict[str, float]]
     """Of each layer's distance over the global views, the shares of `PARTS`; nothing where the loss
     sees the foreground alone, or where the style isn't rendered at the same views."""
     loss, target = scene.loss, scene.target
-    if loss.config.masked or not hasattr(target, "viewer"):
+    if loss.masked or not hasattr(target, "viewer"):
         return {}
     found: list[dict[str, dict[str, torch.Tensor]]] = []
     for viewer, vertices in ((scene.viewer, moved), (target.viewer, target.vertices)):

@@ -125,7 +125,7 @@ def test_a_run_refines_for_its_style_and_says_so():
     fine = subject_of(compose(sized))
     assert len(fine.source.faces) > len(plain.source.faces)
     longest = as_trimesh(fine.source).edges_unique_length.max() / fine.frame.scale
-    assert longest <= 1 / fine.sigma / refinement.PER_WAVE * (1 + 1e-9)
+    assert longest <= 1 / fine.sigma / refinement.EDGES_PER_WAVELENGTH * (1 + 1e-9)
     assert any("refined from" in note for note in fine.notes)
     assert not any("is too coarse" in note for note in fine.notes)
 

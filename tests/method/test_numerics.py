@@ -78,7 +78,7 @@ def test_what_is_not_a_number_is_named_with_its_step(method, scene, part, named)
     state = method.start(broken)
     with pytest.raises(Diverged, match=f"^{named} NaN or infinite at step") as caught:
         list(method.optimise(broken, state))
-    assert caught.value.step == state.step
+    assert caught.value.step == state.step + 1
     assert all(p.isfinite().all() for p in state.field.parameters())
 
 
@@ -86,7 +86,7 @@ def test_a_gradient_that_is_not_a_number_never_reaches_the_field(method, scene):
     state = method.start(scene)
     weights = [p.clone() for p in state.field.parameters()]
     state.field.last.weight.register_hook(lambda grad: grad * math.inf)
-    with pytest.raises(Diverged, match="the gradient became NaN or infinite at step 0"):
+    with pytest.raises(Diverged, match="the gradient became NaN or infinite at step 1"):
         list(method.optimise(scene, state))
     for before, after in zip(weights, state.field.parameters(), strict=True):
         assert torch.equal(before, after)
@@ -100,7 +100,7 @@ def test_an_exploding_loss_stops(method, scene):
     for scale, small in zip(scene.scales[1], tiny, strict=True):
         scale.copy_(small)
     try:
-        with pytest.raises(Diverged, match=r"the loss exploded, from .* at step 1"):
+        with pytest.raises(Diverged, match=r"the loss exploded, from .* at step 2"):
             list(steps)
     finally:
         for scale in scene.scales[1]:
@@ -123,7 +123,7 @@ def test_the_command_names_the_last_good_checkpoint(tmp_path, monkeypatch):
         command.run(config, tmp_path / "run", [])
     checkpoint = tmp_path / "run" / "checkpoint.safetensors"
     told = str(caught.value)
-    assert "the loss of the global views became NaN or infinite at step 2" in told
+    assert "the loss of the global views became NaN or infinite at step 3" in told
     assert f"The last good checkpoint is from step 2: {checkpoint}." in told
     status = json.loads((tmp_path / "run" / "status.json").read_text())
     assert (status["status"], status["reason"]) == ("failed", told)

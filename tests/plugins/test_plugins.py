@@ -16,7 +16,7 @@ SMOKE = ["source=torus", "method=robust", "profile=smoke", "hydra.run.dir=run"]
 
 GOOD = """
     from dataclasses import dataclass
-    from styleexp.config.schema import EncoderConfig, FieldConfig, LossConfig, StyleConfig
+    from styleexp.plugins import EncoderConfig, FieldConfig, LossConfig, StyleConfig
     from styleexp.plugins.spec import Spec
 
     @dataclass

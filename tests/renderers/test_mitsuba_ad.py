@@ -18,8 +18,8 @@ from styleexp.renderers.base import RenderOutput, Shading
 from styleexp.renderers.mitsuba_ad import MitsubaAD
 from styleexp.renderers.soft_raster import SoftRaster
 from styleexp.system.errors import UserError
+from styleexp.testing import NotApplicable, rendering
 from styleexp.testing import renderers as testing
-from styleexp.testing import rendering
 from tests.helpers import warm
 
 for package in ("mitsuba", "drjit"):
@@ -53,7 +53,7 @@ def made(kind: type[MitsubaAD]) -> MitsubaAD:
 def test_conformance(kind: type[MitsubaAD], check: testing.Check) -> None:
     try:
         check(made(kind))
-    except testing.NotApplicable as reason:
+    except NotApplicable as reason:
         assert kind is Hard or check.__name__ in TIES
         pytest.skip(str(reason))
 

@@ -211,7 +211,7 @@ def test_a_lost_context_is_noticed(renderer):
 import os
 os.environ["PYOPENGL_PLATFORM"] = "egl"
 import torch
-from styleexp.testing import renderers as testing
+from styleexp.testing import rendering
 from styleexp.system.errors import UserError
 from styleexp.renderers.base import Shading
 from styleexp.renderers.moderngl_deferred import ModernGLDeferred

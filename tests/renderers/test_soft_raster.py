@@ -33,8 +33,8 @@ from styleexp.renderers.soft_raster.shading import (
     faces_seen,
 )
 from styleexp.system.errors import UserError
+from styleexp.testing import NotApplicable, rendering
 from styleexp.testing import renderers as testing
-from styleexp.testing import rendering
 
 
 class HardRaster(SoftRaster):
@@ -51,7 +51,7 @@ class HardRaster(SoftRaster):
 def test_conformance(renderer: SoftRaster, check: testing.Check) -> None:
     try:
         check(renderer)
-    except testing.NotApplicable as reason:
+    except NotApplicable as reason:
         pytest.skip(str(reason))
 
 

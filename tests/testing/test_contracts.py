@@ -2,7 +2,9 @@
 
 import functools
 import importlib.util
+import math
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +15,15 @@ from styleexp import plugins, testing
 from styleexp.encoders import Encoder
 from styleexp.inputs import meshes, shapes
 from styleexp.method.base import Method, displaced
-from styleexp.method.fields import Field
+from styleexp.method.fields import Field, check_field
 from styleexp.method.losses import GramLoss, Loss
 from styleexp.method.options import FieldConfig, LossConfig
 from styleexp.method.paper import PaperLoop
 from styleexp.method.scene import Parts
 from styleexp.plugins.catalogue import BASELINES, FIELDS
 from styleexp.renderers.soft_raster import SoftRaster
+from styleexp.system.errors import UserError
+from styleexp.system.options import check, option
 from styleexp.testing import encoders, fields, losses, methods, styles
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -273,3 +277,38 @@ def test_all_failed_checks_are_listed():
     with pytest.raises(AssertionError, match="2 checks failed:\none: ValueError: the first\nother"):
         checks.run([fine, one, other], None)
     assert losses.images(0).image.shape == (2, losses.SIZE, losses.SIZE, 3)
+
+
+def test_a_field_that_breaks_its_contract_stops_a_run_before_its_first_step():
+    at = fields.points()
+    for forward, message in (
+        (lambda self, points, precision: self.latent[:, None], "shape"),
+        (lambda self, points, precision: self.latent.double(), "float64"),
+        (lambda self, points, precision: self.latent + 5, "beyond its bound of 0.1"),
+    ):
+        made = field(forward)(points=at, generator=None, sigma=5.0, bound=0.1)
+        with pytest.raises(UserError, match=message):
+            check_field(made, at, 0.1)
+
+
+def test_options_have_limits_of_their_own():
+    @dataclass
+    class Inner:
+        share: float = option(0.5, above=0, between=(0, 1))
+
+    @dataclass
+    class Options:
+        kind: str | None = option(None, choices=("a", "b"))
+        sizes: list[float] = option(factory=lambda: [1.0, 2.0], between=(0, 5))
+        inner: Inner = option(factory=Inner)
+
+    check(Options())
+    for options, message in (
+        (Options(kind="c"), "unknown value for kind 'c'"),
+        (Options(sizes=[1.0, 9.0]), r"sizes=\[1.0, 9.0\] is not allowed: give a value from 0 to 5"),
+        (Options(sizes=[math.nan]), "sizes=nan is not allowed: give a finite number"),
+        (Options(inner=Inner(0.0)), "inner.share=0.0 is not allowed: give a value above 0"),
+        (Options(inner=Inner(2.0)), "inner.share=2.0 is not allowed: give a value from 0 to 1"),
+    ):
+        with pytest.raises(UserError, match=message):
+            check(options)

@@ -1,6 +1,6 @@
 """From a configuration to objects: the method with its parts, and what it works on.
 
-The only module that turns options into parts; the method itself takes objects.
+The method itself takes objects, and never sees the configuration.
 """
 
 from __future__ import annotations

@@ -41,13 +41,17 @@ def explain(error: BaseException) -> str:
         from styleexp.config.schema import Config
 
         known = _keys(Config)
+        if full := re.search(r"full_key: (\w+)\.", text):  # others of its section are nearer
+            section = full[1]
+            own = [k for k in [*known, *_keys_of_parts(section)] if k.startswith(f"{section}.")]
+            known = own or known
         near = difflib.get_close_matches(key[1], [k.split(".")[-1] for k in known], n=1)
-        full = [k for k in known if near and k.split(".")[-1] == near[0]]
-        hint = f"did you mean {' or '.join(full)}? " if full else ""
+        meant = [k for k in known if near and k.split(".")[-1] == near[0]]
+        hint = f"did you mean {' or '.join(dict.fromkeys(meant))}? " if meant else ""
         return f"there is no key '{key[1]}': {hint}'styleexp --help' lists the keys."
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     kept = [x for x in lines if not x.startswith(("full_key", "object_type", "reference_type"))]
-    return ": ".join(dict.fromkeys(informative)) or type(error).__name__
+    return ": ".join(dict.fromkeys(kept)) or type(error).__name__
 
 
 def _options(group: str) -> list[str]:
@@ -58,6 +62,14 @@ def _options(group: str) -> list[str]:
 
     loader = ConfigLoaderImpl(create_config_search_path(compose.CONFIG_PATH))
     return loader.get_group_options(group)
+
+
+def _keys_of_parts(kind: str) -> list[str]:
+    """Keys of the options of every usable part of a kind."""
+    from styleexp import plugins
+
+    specs = [c.loaded for c in plugins.everything() if c.kind == kind and not c.fault]
+    return [f"{kind}.{key}" for spec in specs if spec is not None for key in _keys(spec.config)]
 
 
 def _keys(schema: type, prefix: str = "") -> list[str]:

@@ -53,8 +53,8 @@ class Config(Settings):
     """The backend's own options, with its registered ``name``."""
     encoder: EncoderConfig = option(factory=EncoderConfig)
     baseline: Any = None
-    """A method that replaces the optimisation loop, such as ``synthesis``; null: optimise, as
-    `stylize` does. Holds the method's own options, with its registered ``name``; set by
+    """A method that replaces the optimisation loop, such as ``synthesis``; null: the
+    paper's loop. Holds the method's own options, with its registered ``name``; set by
     ``conf/method``."""
     preview: PreviewConfig = option(factory=PreviewConfig)
     metrics: MetricsConfig = option(factory=MetricsConfig)

@@ -122,12 +122,16 @@ def _checked(style: meshes.Mesh | np.ndarray, name: str | None) -> meshes.Mesh |
 
     if isinstance(style, meshes.Mesh):
         return style
-    if isinstance(style, np.ndarray) and style.ndim == 3 and style.shape[2] == 3:
-        return style.astype(np.float32, copy=False)
-    raise UserError(
-        f"the style '{name}' is a {type(style).__name__}: its factory must return a Mesh or an "
-        "image of shape (height, width, 3)."
-    )
+    wanted = "its factory must return a Mesh or an image of floats in [0, 1], (height, width, 3)"
+    if not isinstance(style, np.ndarray):
+        raise UserError(f"the style '{name}' is a {type(style).__name__}: {wanted}.")
+    if style.ndim != 3 or style.shape[2] != 3 or style.dtype.kind != "f":
+        raise UserError(
+            f"the style '{name}' is an array of {style.dtype} of shape {style.shape}: {wanted}."
+        )
+    if not (style.size and 0 <= style.min() <= style.max() <= 1):  # NaN fails too
+        raise UserError(f"the style '{name}' has values outside [0, 1]: {wanted}.")
+    return style.astype(np.float32, copy=False)
 
 
 def locate(kind: str, name: str | None, path: str | None) -> Path | None:

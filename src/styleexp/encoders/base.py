@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-class Encoder(nn.Module):
+class Encoder(nn.Module, ABC):
     """A frozen network that describes images. `testing.check_encoder` checks all of this.
 
     Its parameters don't require gradients; gradients flow to the images. It has no state beyond its
@@ -29,10 +29,11 @@ class Encoder(nn.Module):
     hidden layers run in it too."""
 
     def resolve(self, layers: Sequence[str | int]) -> tuple[str, ...]:
-        """Names of the requested layers, without duplicates. An integer is the paper's 1-based
-        index of a convolution of VGG-19.
+        """Names of the requested layers, in this order. An integer is the paper's 1-based index of
+        a convolution of VGG-19.
 
-        Raises `UserError` for a layer it doesn't have. The default has none.
+        Raises `UserError` for a layer it doesn't have, a duplicate, or an empty list. The default
+        has no layer.
         """
         raise UserError(f"encoder={self.name} has no layers: use a loss that needs none.")
 
@@ -42,7 +43,7 @@ class Encoder(nn.Module):
     ) -> dict[str, Float[Tensor, "images features rows columns"]]:
         """Features of the requested layers, by resolved name, in the order requested.
 
-        ``images`` are in [0, 1], RGB or grey (one channel). Row 0 is at the top, as in the images:
-        cell (i, j) of a layer of ``rows`` x ``columns`` describes pixels ``[i h, (i + 1) h)`` x
-        ``[j w, (j + 1) w)`` with ``h = height / rows`` and ``w = width / columns``.
+        ``images`` are in [0, 1], RGB or grey (one channel), in any size. Cells are spread evenly
+        over the image, row 0 at the top: a masked loss takes a layer's rows for equal parts of the
+        image's height.
         """

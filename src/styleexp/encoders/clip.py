@@ -46,7 +46,13 @@ class ClipEncoder(Encoder):
         """Raise `UserError`: CLIP has no layers; it only works with ``loss=clip``."""
         raise UserError("encoder=clip has no layers for this loss: use loss=clip with it.")
 
-    def forward(  # type: ignore[override]  # an embedding, not layers: for `losses.ClipLoss` alone
+    def forward(
+        self, images: Float[Tensor, "images channels height width"], layers: Sequence[str | int]
+    ) -> dict[str, Tensor]:
+        """Raise `UserError`, as `resolve` does."""
+        return dict.fromkeys(self.resolve(layers), images)
+
+    def embed(
         self, images: Float[Tensor, "images channels height width"]
     ) -> Float[Tensor, "images size"]:
         """Unit embeddings of images in [0, 1], RGB or grey, resized to CLIP's input."""

@@ -275,7 +275,7 @@ def _optimise(
     if folder.checkpoint_step() != state.step:
         folder.save_checkpoint(state)
     if blank:
-        what = "were skipped" if config.loss.masked else "counted as background"
+        what = "were skipped" if scene.skips_blank_views else "counted as background"
         print(
             f"note: {blank} views did not show the mesh and {what} (blank_views in metrics.jsonl)"
         )

@@ -69,5 +69,5 @@ def _in_a_bar(steps: Iterable[Step], done: int, total: int) -> Iterator[Step]:
     with Progress(*columns) as bar:
         task = bar.add_task("", total=total, completed=done, loss=float("nan"), rate=0.0)
         for step in steps:
-            bar.update(task, completed=step.step, loss=step.loss, rate=1 / step.seconds)
+            bar.update(task, completed=step.step, loss=step.loss, rate=1 / max(step.seconds, 1e-9))
             yield step

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 
 class Diverged(UserError):
-    """A step produced values the run cannot continue from."""
+    """A step, counted from 1, produced values the run cannot continue from."""
 
-    def __init__(self, step: int, part: str, reason: str):
-        self.step, self.part = step, part
+    def __init__(self, step: int, reason: str):
+        self.step = step
         super().__init__(
             f"{reason} at step {step}: lower optim.rate, or check the source and the style for "
             "degenerate geometry."
@@ -38,13 +38,23 @@ class Scene:
     notes: tuple[str, ...] = ()
     """Notes for the user, besides the subject's."""
 
+    @property
+    def skips_blank_views(self) -> bool:
+        """Whether views that don't show the mesh count for nothing."""
+        return False
+
 
 @dataclass
 class State:
-    """Everything a step changes; the content of a checkpoint."""
+    """Everything a step changes; the content of a checkpoint.
+
+    Restored are the module's ``state_dict``, the optimiser's tensors of each parameter, and the
+    step. The optimiser's groups are those of `Method.start`: a rate that changes is set anew from
+    ``step`` in every step.
+    """
 
     field: Any
-    """A module such as `fields.FourierMLP`."""
+    """The module that is learned, such as a `fields.FourierMLP`."""
     optimizer: torch.optim.Optimizer
     step: int = 0
 
@@ -127,16 +137,18 @@ class Method(ABC, Generic[S]):
         return None
 
     def optimise(self, scene: S, state: State) -> Iterator[Any]:
-        """Run the steps from ``state.step`` up to ``optim.steps``, yielding a dataclass after each.
+        """Run the steps after ``state.step`` up to ``optim.steps``, yielding a dataclass after
+        each. ``state.step`` is increased before; the state may be saved whenever one is yielded.
 
-        Its fields form a line of ``metrics.jsonl``; ``step``, ``loss`` and ``seconds`` are
-        displayed. Draw random numbers from `views.step_generator`, so that resumed runs are
-        reproducible.
+        The dataclass's fields form a line of ``metrics.jsonl``: ``step``, counted from 1, ``loss``
+        and ``seconds`` are required, and displayed. Draw random numbers from
+        `views.step_generator`, so that resumed runs are reproducible.
         """
         return iter(())
 
     @abstractmethod
     def finish(self, scene: S, state: State | None) -> Result:
-        """The generated mesh, which equals the source where ``subject.mask`` is 0. If its faces
+        """The generated mesh, its displacement multiplied by ``settings.strength``. It equals the
+        source bit for bit where ``subject.mask`` is 0, or everywhere with no strength. If its faces
         differ from the source's, the result's subject has a source with these faces, in the same
         frame."""

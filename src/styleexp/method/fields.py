@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import nn
 from torch.autograd.function import once_differentiable
+
+from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -21,11 +23,12 @@ REMEMBERED = 1 << 25
 """Maximum number of elements of a cached encoding, 128 MB."""
 
 
-class Field(nn.Module):
+class Field(nn.Module, ABC):
     """The contract of a field: a displacement for every vertex. `testing.check_field` checks it.
 
+    No displacement may exceed the ``bound`` that its factory is given (see `plugins.spec.Spec`).
     Its parameters are learned and its buffers are not; both are checkpointed. All random numbers
-    come from the ``generator`` that its factory is given. It is moved with ``to(device)``.
+    come from the factory's ``generator``. It is moved with ``to(device)``.
     """
 
     @abstractmethod
@@ -45,6 +48,24 @@ class Field(nn.Module):
             precision: dtype in which the costly part may compute, bfloat16 where that is faster.
                 The result is evaluated in float32.
         """
+
+
+def check_field(field: Field, points: Float[Tensor, "vertices 3"], bound: float) -> None:
+    """Raise `UserError` if the field breaks its contract before the first step."""
+    with torch.no_grad():
+        displacement = field(points)
+    name = type(field).__name__
+    if displacement.shape != (len(points),) or displacement.dtype != torch.float32:
+        raise UserError(
+            f"the field {name} returns {displacement.dtype} of shape {tuple(displacement.shape)} "
+            f"for {len(points)} vertices: one float32 each is needed (docs/own-field.md)."
+        )
+    largest = float(displacement.abs().max())
+    if not largest <= bound * (1 + 1e-6):
+        raise UserError(
+            f"the field {name} returns displacements of up to {largest:.3g}, beyond its bound of "
+            f"{bound:.3g} (docs/own-field.md)."
+        )
 
 
 class FourierFeatures(nn.Module):
@@ -88,7 +109,7 @@ class FourierFeatures(nn.Module):
 
 
 class FourierMLP(Field):
-    """MLP that maps a position to its displacement along the normal, in (-bound, bound).
+    """MLP that maps a position to its displacement along the normal, in [-bound, bound].
 
     The last layer starts at zero, so that the generated mesh equals the source at step 0, unless
     ``last_layer`` is ``random``. ``sigma`` is in cycles per radius of the normalised source,
@@ -160,7 +181,7 @@ class _LinearRelu(torch.autograd.Function):
 
 
 class VertexField(Field):
-    """A free displacement per vertex, in (-bound, bound), from zero: the field without the
+    """A free displacement per vertex, in [-bound, bound], from zero: the field without the
     network."""
 
     def __init__(self, vertices: int, bound: float):

@@ -1,9 +1,9 @@
 """Cache of target Gram matrices, so that a run similar to an earlier one starts sooner.
 
 Measuring the style and the source takes as long as a dozen steps, and most runs of a study share
-it. Cache files are keyed by a digest of all inputs: meshes, options, weights, the code itself, the
-torch version, threads. Cached values are bit-identical to computed ones. If a file is missing or
-unreadable, the values are computed.
+it. Cache files are keyed by a digest of the inputs: meshes, options, weights, this package's code,
+torch's version, threads, the processor's instructions. On a CPU cached values are those that would
+be computed, bit for bit. If a file is missing or unreadable, the values are computed.
 """
 
 from __future__ import annotations

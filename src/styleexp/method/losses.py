@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import copy
 import math
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -41,6 +41,9 @@ class Loss(ABC):
     loop reads these weights itself.
     """
 
+    masked: bool = False
+    """Whether only pixels that show the mesh count, so that views without it are skipped."""
+
     def for_style(self, style: Style) -> Loss:
         """The loss to use for this style; called once, before anything is described."""
         return self
@@ -50,9 +53,9 @@ class Loss(ABC):
         """Statistics of views, averaged over them; differentiable in ``seen.image``, of shape
         (views, height, width, channels).
 
-        A statistic that nothing in the views counts for, as of a mask (``seen.coverage``) without
-        foreground, is all zeros, never NaN. Views may be described in several calls and their
-        statistics averaged, so a statistic must be linear in the views.
+        A statistic for which no cell counts, such as a masked one without foreground
+        (``seen.coverage``), is all zeros, never NaN. A bank of views is described in several calls,
+        and the statistics of all calls are averaged with equal weight.
         """
 
     @abstractmethod
@@ -166,16 +169,17 @@ class GramLoss(Loss):
 
     def __init__(self, config: LossConfig, encoder: Encoder):
         self.config = config
+        self.masked = config.masked is True
         self.encoder = encoder
         self.layers = encoder.resolve(config.layers)
-        self.weights = [config.block_weights[int(name[4]) - 1] for name in self.layers]
+        self.weights = [config.block_weights[block_of(name) - 1] for name in self.layers]
 
     def for_style(self, style: Style) -> GramLoss:
         """Decide ``loss.masked=pictures`` for this style."""
         if self.config.masked != "pictures":
             return self
         loss = copy.copy(self)
-        loss.config = replace(self.config, masked=style.picture is not None)
+        loss.masked = style.picture is not None
         return loss
 
     def describe(self, seen: Images) -> Statistics:
@@ -208,7 +212,7 @@ class GramLoss(Loss):
         self, seen: Images, cells: Sequence[tuple[int, int]]
     ) -> Sequence[Bool[Tensor, "n rows columns"] | None]:
         """Masks of the cells that count, for layers of these sizes."""
-        if not self.config.masked:
+        if not self.masked:
             return [None] * len(cells)
         return layer_masks(seen.coverage, cells, self.config.erosion)
 
@@ -242,6 +246,17 @@ class GramLoss(Loss):
         return divisors
 
 
+def block_of(layer: str) -> int:
+    """VGG block of a layer named ``convB_I``, 1 to 5. Raises `UserError` for another name."""
+    match = re.match(r"conv([1-5])_", layer)
+    if match is None:
+        raise UserError(
+            f"loss=gram weighs layers by their block: name them convB_I with B from 1 to 5, not "
+            f"'{layer}'."
+        )
+    return int(match[1])
+
+
 class ClipLoss(Loss):
     """Text2Mesh's loss (Michel et al. 2022): one minus the cosine between two mean embeddings."""
 
@@ -250,11 +265,11 @@ class ClipLoss(Loss):
 
         if not isinstance(encoder, ClipEncoder):
             raise UserError("loss=clip compares embeddings of whole pictures: use encoder=clip.")
-        self.encoder = encoder
+        self.clip = encoder
 
     def describe(self, seen: Images) -> Statistics:
         """The mean embedding of the pictures, background included."""
-        return [self.encoder(seen.image.permute(0, 3, 1, 2)).mean(0)]
+        return [self.clip.embed(seen.image.permute(0, 3, 1, 2)).mean(0)]
 
     def distance(
         self, found: Statistics, target: Statistics, scales: list[Tensor]

@@ -98,7 +98,7 @@ class FieldConfig:
     """How displacements are kept within the bound: ``tanh``, or ``clamp``, which has no gradient at
     the bound."""
     bound: float | None = option(None, between=(0.0001, 1.0))
-    """Displacements lie in (-bound, bound), in radii. null: twice the half range of the style
+    """Displacements lie in [-bound, bound], in radii. null: twice the half range of the style
     mesh's relief; for an image, whose height is unknown, twice 0.15 of its wavelength. Paper:
     0.1."""
     start: str = option("map", choices=("map", "source", "synthesis"))
@@ -227,7 +227,7 @@ class LossConfig:
 
 @dataclass
 class OptimConfig:
-    """Adam with a stepped rate (Sec. 4.1)."""
+    """Adam and its learning rate (Sec. 4.1)."""
 
     steps: int = option(160, between=(1, 1_000_000_000))
     rate: float = option(4e-3, above=0)

@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING
 import torch
 
 from styleexp.method.base import Method, Result, State, Step, displaced
-from styleexp.method.fields import Field, zero_mean
+from styleexp.method.fields import Field, check_field, zero_mean
 from styleexp.method.gram_cache import uncached
 from styleexp.method.masks import masked
 from styleexp.method.scene import Cache, PaperScene, Parts, prepare
 from styleexp.method.stepping import (
     check_numbers,
-    gradient_length,
+    gradient_norm,
     learning_rate,
     normalise_gradient,
 )
@@ -65,11 +65,12 @@ class PaperLoop(Method[PaperScene]):
             bound=subject.bound * (1.0 if scene.base is None else settings.field.learned),
         )
         field.to(subject.surface.vertices.device)
+        check_field(field, subject.surface.vertices, subject.bound)
         return State(field, torch.optim.Adam(field.parameters(), lr=settings.optim.rate))
 
     def optimise(self, scene: PaperScene, state: State) -> Iterator[Step]:
         """Run the remaining steps, yielding after each; ``state`` may be saved between them."""
-        subject, loss, weights = scene.subject, scene.loss, scene.subject.settings.loss
+        subject, loss, options = scene.subject, scene.loss, scene.subject.settings.loss
         optim, surface = subject.settings.optim, subject.surface
         first: float | None = None
         while state.step < optim.steps:
@@ -85,9 +86,9 @@ class PaperLoop(Method[PaperScene]):
             whole_target, local_target = scene.target(state.step)
             loss_global = loss.distance(loss.describe(whole), whole_target, scene.scales[0])
             loss_local = loss.distance(loss.describe(local), local_target, scene.scales[1])
-            total = weights.lambda_global * loss_global + weights.lambda_local * loss_local
-            relief = (displacement / subject.relief).pow(4).mean()
-            total = total + weights.relief_weight * relief
+            total = options.lambda_global * loss_global + options.lambda_local * loss_local
+            penalty = (displacement / subject.relief).pow(4).mean()
+            total = total + options.relief_weight * penalty
 
             first = total.item() if first is None else first
             measured = {
@@ -98,11 +99,11 @@ class PaperLoop(Method[PaperScene]):
                 "the loss of the local views": loss_local,
                 "the loss": total,
             }
-            check_numbers(state.step, measured, total.item(), first)
+            check_numbers(state.step + 1, measured, total.item(), first)
             state.optimizer.zero_grad()
             total.backward()
-            gradient = gradient_length(state.field)
-            check_numbers(state.step, {"the gradient": gradient})
+            gradient = gradient_norm(state.field)
+            check_numbers(state.step + 1, {"the gradient": gradient})
             if optim.unit_gradient:
                 normalise_gradient(state.field, gradient)
             state.optimizer.step()

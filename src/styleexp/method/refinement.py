@@ -6,24 +6,24 @@ import math
 
 from styleexp.inputs import meshes
 
-PER_WAVE = 12.0
+EDGES_PER_WAVELENGTH = 12.0
 """Number of longest edges per wavelength of the style's relief when refining the source; half as
 many blur the grooves between bubbles."""
-MOST_REFINED = 200_000
+MAX_FACES = 200_000
 """Maximum number of faces that refining aims for."""
-SHORTER = 0.65
+MEAN_TO_LONGEST = 0.65
 """Ratio of mean to longest edge after refining, which halves edges."""
 
 
 def refined(mesh: meshes.Mesh, wavelength: float, how: str) -> meshes.Mesh:
     """Refine the mesh until its edges are short enough for a relief of this wavelength, in radii.
-    ``how`` is ``source.refine``: a target number of faces, or ``auto``, at most `MOST_REFINED`."""
+    ``how`` is ``source.refine``: a target number of faces, or ``auto``, at most `MAX_FACES`."""
     scale = meshes.normalisation(mesh.vertices).scale
     area = meshes.face_areas(mesh.vertices, mesh.faces).sum()
-    faces = MOST_REFINED if how == "auto" else float(how)
-    longest = math.sqrt(area / (faces * math.sqrt(3) / 4)) / SHORTER
+    faces = MAX_FACES if how == "auto" else float(how)
+    longest = math.sqrt(area / (faces * math.sqrt(3) / 4)) / MEAN_TO_LONGEST
     if how == "auto":
-        return meshes.refine(mesh, max(wavelength / PER_WAVE * scale, longest))
+        return meshes.refine(mesh, max(wavelength / EDGES_PER_WAVELENGTH * scale, longest))
     # On a uniform mesh, a tiny change of the length decides if all edges are halved or only some.
     low, high = longest / 2, longest * 2
     fine = mesh

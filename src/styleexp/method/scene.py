@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from styleexp.renderers.base import Renderer
 
 Cache: TypeAlias = "Callable[[list[object], Callable[[], Pair]], Pair]"
-"""Returns what its second argument computes from its first; see `gram_cache.GramCache`."""
+"""Called with the inputs of a computation and the computation; see `gram_cache.GramCache`."""
 Pair: TypeAlias = "tuple[Statistics, Statistics]"
 """Statistics of global and of local views."""
 
@@ -58,6 +58,11 @@ class PaperScene(Scene):
     scales: tuple[list[Tensor], list[Tensor]]
     """Divisors of the distances of global and local views; see `losses.Loss.scales`."""
     encoder: Encoder
+
+    @property
+    def skips_blank_views(self) -> bool:
+        """Whether only the mesh counts for the loss."""
+        return self.loss.masked
 
     @property
     def precision(self) -> torch.dtype:

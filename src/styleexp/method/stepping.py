@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from styleexp.method.options import OptimConfig
 
 EXPLODED = 1e6
-"""The run counts as diverged above this multiple of the first loss."""
+"""The run counts as diverged above this multiple of one plus the first loss."""
 
-MOST_RATE = 10.0
+MAX_SPEEDUP = 10.0
 """Most that ``optim.nominal_steps`` raises the rate: beyond, displacements saturate within a few
 steps."""
 
@@ -30,15 +30,15 @@ any other, but their direction is mostly noise."""
 def learning_rate(optim: OptimConfig, step: int) -> float:
     """Learning rate of a step; see ``OptimConfig.schedule``."""
     if optim.schedule == "step":
-        shorter = min((optim.nominal_steps or optim.steps) / optim.steps, MOST_RATE)
-        decays = math.floor(step * shorter / optim.decay_every)
-        return optim.rate * shorter * optim.decay**decays
+        speedup = min((optim.nominal_steps or optim.steps) / optim.steps, MAX_SPEEDUP)
+        decays = math.floor(step * speedup / optim.decay_every)
+        return optim.rate * speedup * optim.decay**decays
     rising = min(1.0, (step + 1) / (WARM_UP * optim.steps))
     falling = 0.5 * (1 + math.cos(math.pi * step / optim.steps))
     return optim.rate * rising * (0.05 + 0.95 * falling)
 
 
-def gradient_length(field: torch.nn.Module) -> Float[Tensor, ""]:
+def gradient_norm(field: torch.nn.Module) -> Float[Tensor, ""]:
     """Norm of the gradient over all parameters."""
     return torch.nn.utils.get_total_norm([p.grad for p in field.parameters() if p.grad is not None])
 
@@ -54,14 +54,15 @@ def check_numbers(
     step: int, parts: dict[str, Tensor], total: float = 0.0, first: float = 0.0
 ) -> None:
     """Raise `Diverged` for the first part that isn't finite, or if the loss ``total`` exceeds
-    `EXPLODED` times the ``first`` one. All parts are checked, because a fused ReLU turns NaN into
-    0, so NaN in a picture may not reach the loss. The field is still unchanged by the step."""
+    `EXPLODED` times one plus the ``first`` one of this process. All parts are checked, because a
+    fused ReLU turns NaN into 0, so NaN in a picture may not reach the loss. The field is still
+    unchanged by the step."""
     # Minimum and maximum are NaN if any value is: four times as fast as checking each value. All
     # parts are checked together, since each transfer synchronises the GPU.
     ranges = [torch.stack(values.detach().aminmax()) for values in parts.values()]
     finite = torch.stack([each.isfinite().all() for each in ranges]).tolist()
     for part, is_finite in zip(parts, finite, strict=True):
         if not is_finite:
-            raise Diverged(step, part, f"{part} became NaN or infinite")
+            raise Diverged(step, f"{part} became NaN or infinite")
     if abs(total) > EXPLODED * (1 + abs(first)):
-        raise Diverged(step, "the loss", f"the loss exploded, from {first:.3g} to {total:.3g},")
+        raise Diverged(step, f"the loss exploded, from {first:.3g} to {total:.3g},")

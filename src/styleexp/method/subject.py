@@ -59,7 +59,7 @@ class Subject:
     """Standard deviation of the Fourier frequencies, in cycles per radius of the normalised
     source."""
     bound: float
-    """Displacements lie in (-bound, bound), in radii of the normalised source."""
+    """Displacements lie in [-bound, bound], in radii of the normalised source."""
     relief: float
     """Half the range of the style's own relief, in radii of the normalised source."""
     heights: Heights | None = None

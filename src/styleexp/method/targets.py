@@ -37,7 +37,7 @@ class StyleTarget(Protocol):
 
 
 class FixedTarget:
-    """Constant Statistics, averaged over a bank of views of the style."""
+    """Constant statistics, averaged over a bank of views."""
 
     def __init__(self, whole: Statistics, local: Statistics):
         self.statistics = whole, local

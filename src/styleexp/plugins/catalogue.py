@@ -244,7 +244,7 @@ def _synthesis(config: SynthesisConfig) -> Method[Any]:
     return Synthesis(config)
 
 
-# source.refine=auto depends on field.sigma.
+# field.sigma is read because source.refine=auto depends on it.
 BASELINES = _named(
     Spec(
         "displacement_map",

@@ -176,8 +176,8 @@ def build(kind: str, options: Any, **given: Any) -> Any:
         if choice.origin == OWN:
             raise
         raise UserError(
-            f"the {kind} '{name}' of {choice.origin} failed: {_one_line(error)} (debug=true shows the "
-            "traceback)."
+            f"the {kind} '{name}' of {choice.origin} failed: {_one_line(error)} (debug=true shows "
+            "the traceback)."
         ) from error
 
 

@@ -23,8 +23,9 @@ class Spec:
       `method.fields.Field`.
     - loss: ``factory(options, encoder=)``; a `LossConfig`. A `method.losses.Loss`.
     - baseline: ``factory(options)``; any dataclass. A `method.base.Method`.
-    - logger: ``factory(options, folder=, record=, step=)``; any dataclass. A `loggers.Logger` for
-      the run in that folder, whose ``run.json`` is ``record``, starting at ``step``.
+    - logger: ``factory(options, folder=, record=, step=)``; any dataclass. A
+      `plugins.loggers.Logger` for the run in that folder, whose ``run.json`` is ``record``,
+      starting at ``step``.
 
     ``config`` may add fields to the class named, and limits with `system.options.option`.
     """

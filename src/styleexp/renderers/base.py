@@ -122,10 +122,10 @@ class Renderer(ABC):
         shading: Shading,
         resolution: tuple[int, int],
     ) -> RenderOutput:
-        """Render one mesh from every camera. The only entry: everything that is rendered comes
-        here.
+        """Render one mesh from every camera.
 
-        ``resolution`` is (height, width) in pixels. ``shading.light`` may hold several lights; a
+        ``resolution`` is (height, width) in pixels. The output has the device and dtype of
+        ``vertices``. ``shading.light`` may hold several lights, on any device (`lights_of`); a
         backend that shades with one at a time is decorated with `one_light_at_a_time`. Gradients
         flow from ``image`` (and, with visibility gradients, ``coverage``) to ``vertices``. An empty
         mesh renders the background.

@@ -262,6 +262,8 @@ def _steps(path: Path) -> tuple[list[dict[str, float]], int]:
     steps: list[dict[str, float]] = []
     damaged = 0
     try:
+        if not path.is_file():  # a pipe would block
+            return [], 0
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
         return [], 0

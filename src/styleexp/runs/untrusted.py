@@ -1,8 +1,8 @@
 """Load the files of a run's folder, which may come from a stranger (SECURITY.md).
 
-Every reader of run folders loads them here: JSON objects of plain values, limited in size and
-depth. A record must not hold interpolations, which could read the environment, and its sections
-must have the types that this package writes. Needs only the standard library.
+Every reader of run folders loads records, statuses and lists of jobs here: JSON objects of plain
+values, limited in size and depth. A record must not hold interpolations, which could read the
+environment, and its sections must have the types that this package writes. Imports nothing heavy.
 """
 
 from __future__ import annotations

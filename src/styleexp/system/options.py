@@ -23,7 +23,7 @@ def option(
     above: float | None = None,
     between: tuple[float, float] | None = None,
 ) -> Any:
-    """A dataclass field with limits, which don't apply to None.
+    """A dataclass field with limits. They don't apply to None; of a list, to every element.
 
     Args:
         default: the default value.
@@ -47,20 +47,22 @@ def check(options: Any) -> None:
     """
     found = list(_values(options))
     for key, value, limits in found:
-        if "choices" in limits and value not in limits["choices"]:
+        if "choices" in limits and value not in (None, *limits["choices"]):
             raise unknown_name(f"value for {key}", str(value), map(str, limits["choices"]))
     for key, value, _ in found:
         for number in value if isinstance(value, list) else [value]:
             if isinstance(number, int | float) and not math.isfinite(number):
                 raise UserError(f"{key}={number} is not allowed: give a finite number.")
     for key, value, limits in found:
-        if value is None:
-            continue
-        if "above" in limits and not value > limits["above"]:
-            raise UserError(f"{key}={value} is not allowed: give a value above {limits['above']}.")
-        low, high = limits.get("between", (-math.inf, math.inf))
-        if "between" in limits and not low <= value <= high:
-            raise UserError(f"{key}={value} is not allowed: give a value from {low} to {high}.")
+        for number in value if isinstance(value, list) else [value]:
+            if number is None:
+                continue
+            if "above" in limits and not number > limits["above"]:
+                least = limits["above"]
+                raise UserError(f"{key}={value} is not allowed: give a value above {least}.")
+            low, high = limits.get("between", (-math.inf, math.inf))
+            if "between" in limits and not low <= number <= high:
+                raise UserError(f"{key}={value} is not allowed: give a value from {low} to {high}.")
 
 
 def _values(options: Any, prefix: str = "") -> Iterator[tuple[str, Any, Mapping[str, Any]]]:

@@ -95,11 +95,15 @@ def a_step_down_the_gradient_lowers_the_distance(loss: Loss) -> None:
 
 def images_that_show_nothing_do_no_harm(loss: Loss) -> None:
     """Images without the mesh, whose coverage is zero, have finite statistics and a finite distance
-    and gradient, also as the target. A masked loss has all zeros there: it then doesn't count."""
+    and gradient, also as the target. If all statistics are zeros there, as a masked loss's are,
+    nothing counts: a style that isn't seen is no distance from anything."""
     seen = images(0)
     leaf = torch.zeros_like(seen.image).requires_grad_()
     empty = loss.describe(Images(leaf, torch.zeros_like(seen.coverage)))
     own = loss.describe(seen)
+    if not any(bool(each.any()) for each in empty):
+        none = [each.detach() for each in empty]
+        assert float(_distance(loss, own, none, own)) == 0, "a style that isn't seen counts"
     for found, target in ((empty, own), (own, [each.detach() for each in empty])):
         value = _distance(loss, found, target, own)
         assert bool(value.isfinite()), f"the distance is {float(value)}"

@@ -139,12 +139,13 @@ def several_lights_are_several_pictures(renderer: Renderer) -> None:
         together, apart = vertices.clone().requires_grad_(), vertices.clone().requires_grad_()
         resolution = (48, 48)
         lit = replace(shading, light=lights)
-        out = renderer.render(together, faces, cameras, lit, resolution)
+        out = rendered(renderer, together, faces, cameras, lit, resolution)
         assert out.image.shape == (2, 48, 48, 3)
         weights = torch.linspace(0, 1, out.image.numel()).view_as(out.image).sin()
         (out.image * weights).sum().backward()
         for i, light in enumerate(lights):
-            one = renderer.render(apart, faces, cameras, replace(shading, light=light), resolution)
+            alone = replace(shading, light=light)
+            one = rendered(renderer, apart, faces, cameras, alone, resolution)
             channel = one.image[..., min(i, one.image.shape[-1] - 1)]
             assert torch.allclose(out.image[..., i], channel, atol=1e-5)
             (channel * weights[..., i]).sum().backward()

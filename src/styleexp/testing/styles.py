@@ -33,8 +33,8 @@ def a_picture_has_contrast(content: Content) -> None:
 
 
 def a_mesh_is_sound(content: Content) -> None:
-    """A mesh has finite vertices, faces that refer to them, no face without area, and as many
-    faces out as in: its volume is positive if it is closed."""
+    """A mesh has finite vertices, faces that refer to them, no face without area, and, if it is
+    closed, outward winding."""
     if not isinstance(content, Mesh):
         raise checks.NotApplicable("it is a picture")
     vertices, faces = content.vertices, content.faces

@@ -177,8 +177,7 @@ class GeometricTextures(Method[TextureScene]):
             state.step += 1
             loss, critic, penalty, error = np.mean(measured, axis=0).tolist()
             if not np.isfinite([loss, critic, penalty, error]).all():
-                part = f"the loss of level {number}"
-                raise Diverged(state.step, part, f"{part} became NaN or infinite")
+                raise Diverged(state.step, f"the loss of level {number} became NaN or infinite")
             seconds = time.perf_counter() - begun
             yield TextureStep(state.step, number, loss, critic, penalty, error, seconds)
 
