@@ -22,8 +22,9 @@ from styleexp.method.paper import PaperLoop
 from styleexp.method.scene import Parts
 from styleexp.plugins.catalogue import BASELINES, FIELDS
 from styleexp.renderers.soft_raster import SoftRaster
+from styleexp.system import options as limits
 from styleexp.system.errors import UserError
-from styleexp.system.options import check, option
+from styleexp.system.options import option
 from styleexp.testing import encoders, fields, losses, methods, styles
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -302,7 +303,7 @@ def test_options_have_limits_of_their_own():
         sizes: list[float] = option(factory=lambda: [1.0, 2.0], between=(0, 5))
         inner: Inner = option(factory=Inner)
 
-    check(Options())
+    limits.check(Options())
     for options, message in (
         (Options(kind="c"), "unknown value for kind 'c'"),
         (Options(sizes=[1.0, 9.0]), r"sizes=\[1.0, 9.0\] is not allowed: give a value from 0 to 5"),
@@ -311,4 +312,4 @@ def test_options_have_limits_of_their_own():
         (Options(inner=Inner(2.0)), "inner.share=2.0 is not allowed: give a value from 0 to 1"),
     ):
         with pytest.raises(UserError, match=message):
-            check(options)
+            limits.check(options)
