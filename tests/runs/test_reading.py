@@ -3,7 +3,6 @@
 import ast
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +11,9 @@ from styleexp.inputs import meshes, shapes
 from styleexp.runs import finding, jobs, reading, results, untrusted
 from styleexp.runs.jobs import Job
 from styleexp.system.errors import UserError
+from tests.helpers import ROOT
 
-PACKAGE = Path(__file__).parent.parent / "src" / "styleexp"
+PACKAGE = ROOT / "src" / "styleexp"
 GOOD = {"schema": 1, "overrides": ["a=1"], "config": {"source": {"name": "spot", "path": None}}}
 
 

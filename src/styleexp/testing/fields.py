@@ -6,10 +6,10 @@ returns, which is a plugin's factory without its options: ``partial(factory, opt
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
 
 import torch
+from safetensors.torch import load, save
 
 from styleexp.method.fields import Field
 from styleexp.testing import checks
@@ -93,10 +93,7 @@ def it_keeps_its_bound(build: Build) -> None:
 def a_checkpoint_brings_it_back(build: Build) -> None:
     """Its ``state_dict`` is all there is: loaded into a field just made, it gives the same bits."""
     field, other = _learned(build), made(build, 9)
-    stored = io.BytesIO()
-    torch.save(field.state_dict(), stored)
-    stored.seek(0)
-    other.load_state_dict(torch.load(stored, weights_only=True))
+    other.load_state_dict(load(save(field.state_dict())))
     assert torch.equal(field(points()), other(points()))
 
 
