@@ -1,1 +1,1 @@
-"""Rendering backends: the contract in `base`, the built-in ones by name in `specs`."""
+"""Rendering backends: the contract in `base`, the default in `soft_raster`."""

@@ -1,1 +1,1 @@
-"""A run's folder: identity, files, reading back, previews and loggers."""
+"""A run's folder: identity, files, reading back, previews and baking."""

@@ -31,10 +31,8 @@ _FAR = 1e30
 
 @dataclass(frozen=True)
 class FacePairs:
-    """Candidate pairs (view, face): facing the camera and not entirely outside the frame.
-
-    Sorted by view, then by face.
-    """
+    """Candidate pairs (view, face): facing the camera and not entirely outside the frame. Sorted by
+    view, then by face."""
 
     view: Int[Tensor, " pairs"]
     face: Int[Tensor, " pairs"]
