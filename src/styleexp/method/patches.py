@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from styleexp.renderers.base import Cameras
 
 WINDOW = 1.0
-"""Width of a window, in units of the pattern (see ``scene.pattern_unit``)."""
+"""Width of a window, in units of the pattern (see `subject.pattern_unit`)."""
 SIZE = 96
 """Side of a window in pixels."""
 COARSEST = 0.5
