@@ -80,3 +80,15 @@ def test_with_both_checkpoints_damaged_the_run_begins_anew(tmp_path):
     assert told.count("is damaged") == 2
     assert told.endswith("restarting the run.")
     assert (begun.step, torch.equal(field.weight, before)) == (0, True)
+
+
+def test_a_file_elsewhere_is_named_not_the_runs_folder(tmp_path):
+    from styleexp.experiments import endings
+
+    folder = records.RunFolder(tmp_path / "run")
+    folder.path.mkdir()
+    elsewhere = PermissionError(13, "Permission denied", str(tmp_path / "weights.safetensors"))
+    message = str(endings.failed_writing(folder, elsewhere))
+    assert message.startswith(f"'{tmp_path / 'weights.safetensors'}' can't be read or written")
+    full = OSError(28, "No space left on device", str(folder.path / "result.ply"))
+    assert f"writing to '{folder.path}' failed" in str(endings.failed_writing(folder, full))

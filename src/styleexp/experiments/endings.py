@@ -57,6 +57,11 @@ def failed_writing(folder: RunFolder, error: OSError) -> UserError:
         fail(folder, message)
         return UserError(message)
     fail(folder, str(error))
+    if error.filename is not None and not _is_within(error.filename, folder.path):
+        return UserError(
+            f"'{error.filename}' can't be read or written ({error.strerror or error}): check its "
+            "permissions and the free space."
+        )
     return UserError(
         f"writing to '{folder.path}' failed ({error.strerror or error}): free some space or "
         "choose another folder with hydra.run.dir=FOLDER."
