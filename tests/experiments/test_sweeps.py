@@ -392,15 +392,13 @@ def test_a_job_finds_nothing_of_the_one_before_it_in_its_process():
     import numpy as np
     import torch
 
-    from styleexp.config.compose import compose
     from styleexp.system.process import _default_threads, prepare
 
-    given = ("source=torus", "style=rail")
     default = _default_threads()
-    prepare(compose([*given, f"threads={default + 1}"]))
+    prepare(threads=default + 1, seed=0)
     assert torch.get_num_threads() == default + 1
     first = torch.rand(3).tolist(), np.random.rand(3).tolist(), random.random()
-    prepare(compose(given))
+    prepare(threads=0, seed=0)
     assert torch.get_num_threads() == default
     assert (torch.rand(3).tolist(), np.random.rand(3).tolist(), random.random()) == first
 

@@ -28,5 +28,7 @@ def run(checks: Sequence[Callable[[Part], Any]], part: Part) -> dict[str, str]:
         except Exception as error:  # a part's own exceptions are failures too
             failures.append(f"{check.__name__}: {type(error).__name__}: {error}")
     if failures:
-        raise AssertionError(f"{len(failures)} checks failed:\n" + "\n".join(failures))
+        raise AssertionError(
+            f"{len(failures)} of {len(checks)} checks failed:\n" + "\n".join(failures)
+        )
     return outcomes

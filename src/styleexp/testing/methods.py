@@ -18,7 +18,7 @@ import torch
 from styleexp.inputs import shapes
 from styleexp.inputs.style import Style
 from styleexp.method.base import Method, Result
-from styleexp.method.options import OptimConfig, Settings
+from styleexp.method.options import LocalViewsConfig, OptimConfig, Settings, ViewsConfig
 from styleexp.method.subject import measure
 from styleexp.runs.records import RunFolder
 from styleexp.testing import checks
@@ -28,7 +28,9 @@ STEPS = 3
 
 
 def _settings(**changed: Any) -> Settings:
-    settings = Settings(optim=OptimConfig(steps=STEPS))
+    local = LocalViewsConfig(per_view=2, size=64)
+    views = ViewsConfig(count=2, resolution=96, local=local)
+    settings = Settings(optim=OptimConfig(steps=STEPS), views=views)
     for key, value in changed.items():
         setattr(settings, key, value)
     return settings
