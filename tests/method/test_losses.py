@@ -1,10 +1,13 @@
 import copy
 
+import numpy as np
 import pytest
 import torch
 from torch.nn import functional
 
 from styleexp.encoders import VGG
+from styleexp.inputs import shapes
+from styleexp.inputs.style import Style
 from styleexp.method.losses import UNDIVIDED, GramLoss, gram_matrix, layer_mask, layer_masks
 from styleexp.method.options import LossConfig
 from styleexp.method.viewer import Images
@@ -142,3 +145,13 @@ def test_a_layer_whose_target_is_empty_does_not_count(encoder):
     target, source = grams(loss, images, dot), grams(loss, images * 0.5)
     assert target[4].abs().sum() == 0
     assert loss.distance(source, target, loss.scales(target, source)) == 0
+
+
+@pytest.mark.parametrize(
+    ("masked", "mesh", "picture"),
+    [(True, True, True), (1, True, True), (False, False, False), ("pictures", False, True)],
+)
+def test_what_is_masked_is_decided_by_the_style(encoder, masked, mesh, picture):
+    loss = GramLoss(LossConfig(masked=masked), encoder)
+    assert loss.for_style(Style.of(shapes.make("sphere", 100))).masked == mesh
+    assert loss.for_style(Style.of(np.zeros((8, 8, 3), np.float32))).masked == picture

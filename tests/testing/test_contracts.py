@@ -20,6 +20,7 @@ from styleexp.method.losses import GramLoss, Loss
 from styleexp.method.options import FieldConfig, LossConfig
 from styleexp.method.paper import PaperLoop
 from styleexp.method.scene import Parts
+from styleexp.method.stepping import gradient_norm
 from styleexp.plugins.catalogue import BASELINES, FIELDS
 from styleexp.renderers.soft_raster import SoftRaster
 from styleexp.system import options as limits
@@ -118,6 +119,23 @@ def test_the_guides_encoder(monkeypatch, tmp_path):
 def test_the_guides_method(tmp_path):
     module = guide("baselines.md", tmp_path)
     testing.check_method(lambda: module.build(module.Options()))
+
+
+def test_the_guides_renderer_acts_in_a_run(encoder, tmp_path):
+    """Its hook shortens the gradients that reach the field."""
+    module = guide("write-a-backend.md", tmp_path)
+    norms = {}
+    for limit in (1e3, 1e-9):
+        loss = GramLoss(LossConfig(layers=["conv1_1"], bank_views=2), encoder)
+        parts = Parts(module.GENTLE.factory(module.Options(limit=limit)), encoder, loss)
+        method = PaperLoop(parts, functools.partial(plugins.build, "field", FieldConfig()))
+        settings = methods._settings()
+        settings.loss.relief_weight, settings.optim.unit_gradient = 0.0, False
+        scene = methods._prepared(method, settings)
+        state = method.start(scene)
+        next(method.optimise(scene, state))
+        norms[limit] = float(gradient_norm(state.field))
+    assert 0 < norms[1e-9] < 1e-3 * norms[1e3]
 
 
 # ------------------------------------------------------------------------------------- what breaks

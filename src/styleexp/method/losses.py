@@ -169,7 +169,7 @@ class GramLoss(Loss):
 
     def __init__(self, config: LossConfig, encoder: Encoder):
         self.config = config
-        self.masked = config.masked is True
+        self.masked = config.masked not in (False, "pictures")
         self.encoder = encoder
         self.layers = encoder.resolve(config.layers)
         self.weights = [config.block_weights[block_of(name) - 1] for name in self.layers]

@@ -69,9 +69,6 @@ def check_renderer(renderer: Renderer) -> dict[str, str]:
     return checks.run(CHECKS, renderer)
 
 
-# What is visible
-
-
 # Interpolation and light
 
 
@@ -383,12 +380,6 @@ CHECKS: tuple[Check, ...] = (
     gradient_of_smooth_field,
 )
 """All checks; each takes the renderer and raises ``AssertionError`` or ``NotApplicable``."""
-
-
-# Shapes
-
-
-# Cameras and comparisons
 
 
 def conformance_table() -> str:
