@@ -60,12 +60,12 @@ def report(given: list[str]) -> list[Path]:
 
 
 def study(given: list[str]) -> list[Path]:
-    """Write the study's page, or analyse its answers."""
+    """Write the study's page or sheets, or analyse the answers."""
     options = _study_parser().parse_args(given)
     if options.analyse:
         from styleexp.experiments.reports import study_results
 
-        found = study_results.read(options.analyse)
+        found = study_results.read(options.analyse, options.key)
         for note in found.left_out:
             print(f"styleexp-report: {note}", file=sys.stderr)
         return study_results.analyse(found, options.out or options.analyse[0].parent)
@@ -75,6 +75,10 @@ def study(given: list[str]) -> list[Path]:
         )
     if not options.folder.is_dir():
         raise UserError(f"there is no folder '{options.folder}': give one with finished runs.")
+    if options.sheets is not None:
+        from styleexp.experiments.reports import sheets
+
+        return [sheets.write(options.folder, options.sheets, options.seed)]
     from styleexp.experiments.reports import study as study_page
 
     return [study_page.write(options.folder, options.seed, options.title)]
@@ -84,7 +88,8 @@ def _study_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="styleexp-report study",
         description="The user study of Fig. 9: write a page on which people rate every finished "
-        "run below a folder (study.html), or analyse the files that they saved.",
+        "run below a folder (study.html), or pictures for raters who can't open one (--sheets), or "
+        "analyse the answers (--analyse).",
     )
     parser.add_argument(
         "folder", type=Path, nargs="?", metavar="FOLDER", help="folder with the runs"
@@ -92,11 +97,25 @@ def _study_parser() -> argparse.ArgumentParser:
     parser.add_argument("--title", default="Rating of stylised meshes", help="title of the page")
     parser.add_argument("--seed", type=int, default=0, help="seed for the order of the pairs")
     parser.add_argument(
+        "--sheets",
+        type=Path,
+        metavar="OUT",
+        help="write no page, but a picture of each result without its name, and catch trials, to "
+        "OUT/sheets; what they show is in OUT/key.json, and OUT/ratings.csv is to be filled in",
+    )
+    parser.add_argument(
         "--analyse",
         type=Path,
         nargs="+",
         metavar="FILE",
-        help="participants' files: write fig9.png, fig9.csv, ratings.csv and study.json",
+        help="participants' files (JSON), or tables of ratings of sheets (CSV): write fig9.png, "
+        "fig9.csv, ratings.csv and study.json",
+    )
+    parser.add_argument(
+        "--key",
+        type=Path,
+        metavar="FILE",
+        help="key.json of the sheets that the tables rate (default: the one beside the table)",
     )
     parser.add_argument(
         "--out",

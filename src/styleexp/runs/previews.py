@@ -62,11 +62,14 @@ def render_views(
     elevations: list[float],
     azimuths: list[float],
     size: int,
+    frame: Float[np.ndarray, "points 3"] | None = None,
 ) -> np.ndarray:
-    """Render a mesh in the unit sphere, tightly framed, as 8-bit grey (views, size, size)."""
+    """Render a mesh in the unit sphere as 8-bit grey (views, size, size), tightly framed: itself,
+    or all points of ``frame``, to show several meshes at one size."""
     shading = Shading(albedo=0.8, ambient=0.22, light=LIGHT, background=1.0, normals="smooth")
     points = torch.from_numpy(np.ascontiguousarray(vertices)).float()
-    cameras = framed(points, elevations, azimuths)
+    within = points if frame is None else torch.from_numpy(np.ascontiguousarray(frame)).float()
+    cameras = framed(within, elevations, azimuths)
     large = size * SUPERSAMPLING
     with torch.no_grad():
         out = SoftRaster().render(

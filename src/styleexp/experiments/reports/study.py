@@ -23,6 +23,8 @@ NAME = "study.html"
 SCHEMA = "styleexp-study-1"
 QUESTION = "How well does the result match the target style?"
 """Based on the paper: "rate how well the style transfer results matched the target style"."""
+CRAFT = "How clean is it: no mush, no torn or broken parts, the source's shape kept?"
+"""The second question, of sheets alone; not in the paper."""
 LOWEST, HIGHEST = "not a match", "perfect"
 """Labels of ratings 1 and 5, from the paper."""
 
