@@ -91,12 +91,12 @@ def test_files_that_cannot_count_are_named_and_left_out(tmp_path):
         unlabelled=json.dumps({"schema": "styleexp-study-1"}),
     )
     study = study_results.read([*paths, tmp_path / "gone.json"])
-    assert [each.participant for each in study.answers] == ["a", "b"]
+    assert [each.rater for each in study.answers] == ["a", "b"]
     named = {told.split("'")[1].split("/")[-1] for told in study.left_out}
     assert named == {path.name for path in paths[2:]} | {"gone.json"}
     assert all(told.endswith(".") for told in study.left_out)
-    assert study.matrix[0].tolist() == [5, 4]
-    assert math.isnan(study.matrix[1, 1])
+    assert study.matrix("match", ["0", "1"])[0].tolist() == [5, 4]
+    assert math.isnan(study.matrix("match", ["1"])[1, 0])
     with pytest.raises(UserError, match="no file with answers"):
         study_results.read(paths[2:3])
 
