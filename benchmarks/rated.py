@@ -23,6 +23,8 @@ import numpy as np
 import trimesh
 
 from styleexp.config import build
+from styleexp.config.compose import compose
+from styleexp.experiments import execute
 from styleexp.experiments.metrics.board import read_result
 from styleexp.experiments.metrics.truth import noise
 from styleexp.inputs import meshes
@@ -144,12 +146,39 @@ def altered(run: Run, target: Path, vertices: np.ndarray, faces: np.ndarray) -> 
     (target / "result.ply").write_bytes(mesh.export(file_type="ply"))
 
 
+def bumpy_cube() -> trimesh.Trimesh:
+    """A cube with five by five bumps on each side."""
+    cube = trimesh.creation.box((1.2, 1.2, 1.2))
+    vertices, faces = cube.vertices, cube.faces
+    for _ in range(6):
+        vertices, faces = trimesh.remesh.subdivide(vertices, faces)
+    place = np.abs(vertices).argmax(axis=1)
+    waves = np.sin(vertices * (5 * np.pi / 1.2) + np.pi / 2) ** 2
+    waves[np.arange(len(place)), place] = 1.0
+    side = np.zeros_like(vertices)
+    side[np.arange(len(place)), place] = np.sign(vertices[np.arange(len(place)), place])
+    return trimesh.Trimesh(vertices + 0.08 * waves.prod(axis=1)[:, None] * side, faces)
+
+
+def learn_cube(folder: Path) -> None:
+    """The cube on a cow, learned: sharp edges and no relief that bends."""
+    style = folder / "cube" / "cube.ply"
+    out = folder / "cube" / "spot_cube"
+    if out.exists():
+        return
+    out.mkdir(parents=True)
+    style.write_bytes(bumpy_cube().export(file_type="ply"))
+    overrides = ["source=spot", f"style={style}", "method=robust", "profile=fast", "report=false"]
+    execute.run(compose(overrides), out, overrides)
+
+
 def main() -> int:
     """Alter the results below a folder."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="of sweeps/rated.yaml")
     folder = parser.parse_args().folder
     out = folder / "altered"
+    learn_cube(folder)
     runs = [run for run in finding.find(folder / "synthesis") if run.status == "done"]
     for number, run in enumerate(runs):
         pair = f"{run.part('source')}_{run.part('style')}"

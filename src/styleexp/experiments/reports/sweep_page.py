@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from styleexp.experiments.reports import charts, html, page
+from styleexp.experiments.reports import charts, comparison, html, page
+from styleexp.experiments.reports.comparison import Comparison
 from styleexp.runs import finding
 from styleexp.runs.reading import Run
+from styleexp.runs.records import RunFolder
 from styleexp.system.errors import UserError
 
 NAME = "report.html"
@@ -101,7 +104,8 @@ class Sweep:
 def write(folder: Path, run_pages: bool = True) -> Path:
     """Write the page of all runs below ``folder``; return its path.
 
-    Also writes missing pages of finished runs, unless ``run_pages`` is false. Raises `UserError` if
+    Also writes missing pages of finished runs, unless ``run_pages`` is false, and the means over
+    pairs and seeds, for each swept key, as ``means-KEY.csv`` and ``.tex``. Raises `UserError` if
     there is no run.
     """
     runs = finding.find(folder)
@@ -111,6 +115,13 @@ def write(folder: Path, run_pages: bool = True) -> Path:
         for run in runs:
             if run.status == "done" and not (run.folder / page.NAME).is_file():
                 page.rewrite(run.folder)
+    for sweep in split(folder, runs):
+        target = RunFolder(folder / sweep.name)
+        for each in comparisons(sweep):
+            name = f"means-{each.key.replace('/', '_')}"
+            target.write(f"{name}.csv", functools.partial(comparison.write_csv, each))
+            text = comparison.latex(each)
+            target.write(f"{name}.tex", functools.partial(Path.write_text, data=text))
     return html.save(folder / NAME, build(folder, runs))
 
 
@@ -128,6 +139,9 @@ def build(folder: Path, runs: list[Run]) -> str:
         links={run.folder: _link(run, folder) for run in runs},
         measures={sweep.name: measures(sweep) for sweep in sweeps},
         plots={sweep.name: plots(sweep) for sweep in sweeps},
+        comparisons={sweep.name: comparisons(sweep) for sweep in sweeps},
+        better=comparison.BETTER,
+        caption=comparison.CAPTION,
     )
 
 
@@ -175,6 +189,22 @@ def measures(sweep: Sweep) -> list[str]:
     return list(dict.fromkeys([*first, *(name for run in sweep.runs for name in run.summary)]))
 
 
+def comparisons(sweep: Sweep) -> list[Comparison]:
+    """The means of each swept key's values, for keys with several runs of some value."""
+    found = []
+    for number, key in enumerate(sweep.axes):
+        runs = []
+        for value in sweep.axes[key]:
+            for run in sweep.runs:
+                values = sweep.values(run)
+                if values[number] == value:
+                    rest = (*values[:number], *values[number + 1 :], sweep.seed_of(run) or "")
+                    runs.append((value, rest, run))
+        if len(runs) > len(sweep.axes[key]):
+            found.append(comparison.compare(key, runs))
+    return [each for each in found if each.measures]
+
+
 def plots(sweep: Sweep) -> list[dict[str, Any]]:
     """One chart per axis and number."""
     made = []
@@ -186,7 +216,9 @@ def plots(sweep: Sweep) -> list[dict[str, Any]]:
                     [
                         (sweep.label(run), run.summary[name])
                         for run in sweep.runs
-                        if sweep.values(run)[number] == value and name in run.summary
+                        if sweep.values(run)[number] == value
+                        and run.status == "done"
+                        and name in run.summary
                     ],
                 )
                 for value in values
