@@ -121,6 +121,8 @@ KINDS: dict[str, Callable[[Laid], np.ndarray]] = {
     "swollen": lambda laid: laid.raised(laid.height + 0.07),
     "melted": melted,
     "untouched": lambda laid: laid.base,
+    "inverted": lambda laid: laid.raised(-laid.height),
+    "lower_half": lambda laid: laid.raised(laid.height * (laid.base[:, 1] < 0)),
 }
 
 
