@@ -226,6 +226,37 @@ class LossConfig:
 
 
 @dataclass
+class CellLossConfig(LossConfig):
+    """Options of the losses that compare cells of features (`styleexp.method.cell_losses`)."""
+
+    cells: int = option(4096, between=(16, 65_536))
+    """Most cells of a layer that are compared: of the views of a step, drawn anew in each, and of
+    the style's bank."""
+
+
+@dataclass
+class SlicedConfig(CellLossConfig):
+    """Sliced Wasserstein distances (Heitz et al. 2021)."""
+
+    name: str = "sliced"
+    directions: int = option(128, between=(1, 4096))
+    """Random directions that features are projected on, drawn anew in every step for each layer."""
+
+
+@dataclass
+class NeighbourConfig(CellLossConfig):
+    """Cosine distances to the nearest cell of the style (Kolkin et al. 2022)."""
+
+    name: str = "neighbour"
+    cells: int = option(2048, between=(16, 65_536))
+    """Most cells of a layer that are compared: of the views of a step, drawn anew in each, and of
+    the style's bank. Time grows with the square."""
+    completeness: float = option(1.0, between=(0.0, 1000.0))
+    """Weight of the other direction, from every cell of the style to the nearest of the result,
+    which keeps the result from using the plainest cells alone (Simakov et al. 2008). 0: off."""
+
+
+@dataclass
 class OptimConfig:
     """Adam and its learning rate (Sec. 4.1)."""
 

@@ -29,6 +29,7 @@ from styleexp.method.stepping import (
     normalise_gradient,
 )
 from styleexp.method.surface import unfolded
+from styleexp.method.targets import in_step
 from styleexp.method.views import step_generator
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ class PaperLoop(Method[PaperScene]):
 
     def optimise(self, scene: PaperScene, state: State) -> Iterator[Step]:
         """Run the remaining steps, yielding after each; ``state`` may be saved between them."""
-        subject, loss, options = scene.subject, scene.loss, scene.subject.settings.loss
+        subject, options = scene.subject, scene.subject.settings.loss
         optim, surface = subject.settings.optim, subject.surface
         first: float | None = None
         while state.step < optim.steps:
@@ -82,6 +83,7 @@ class PaperLoop(Method[PaperScene]):
             generated = surface.vertices + displacement[:, None] * surface.normals
             if optim.renormalize:
                 generated = generated / generated.detach().norm(dim=1).max()
+            loss = in_step(scene.loss, optim.seed, state.step)
             whole, local = scene.viewer(generated, state.step)
             whole_target, local_target = scene.target(state.step)
             loss_global = loss.distance(loss.describe(whole), whole_target, scene.scales[0])
