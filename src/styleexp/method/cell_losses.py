@@ -189,7 +189,7 @@ class SlicedLoss(CellLoss):
         layer: int,
     ) -> Float[Tensor, ""]:
         """Mean over directions of the squared 2-Wasserstein distance of the projections."""
-        towards = self.directions(found.shape[1], layer).to(found.device)
+        towards = self.directions(found.shape[1], layer).to(found)
         own, wanted = (found @ towards).t(), (goal @ towards).t()
         with torch.no_grad():
             order = sorting(own)

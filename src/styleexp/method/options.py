@@ -116,6 +116,17 @@ class FieldConfig:
 
 
 @dataclass
+class VertexConfig(FieldConfig):
+    """A free displacement per vertex (`styleexp.method.fields.VertexField`)."""
+
+    name: str = "vertex"
+    smoothness: float = option(0.0, between=(0.0, 1e6))
+    """lambda of large steps (Nicolet et al. 2021): what is learned is u = (I + lambda L) x, so that
+    a step moves neighbours alike, over about the square root of lambda edges. They use 19 and more,
+    with ``optim.second_moment=uniform``. 0: off."""
+
+
+@dataclass
 class LocalViewsConfig:
     """Local views (Sec. 3.3.1, Eq. 2)."""
 
@@ -272,6 +283,10 @@ class OptimConfig:
     the rate is multiplied and the decay interval divided by the same factor, so that a short run
     gets as far as a long one; at most tenfold. null: no rescaling."""
     seed: int = 0
+    second_moment: str = option("each", choices=("each", "uniform"))
+    """Adam divides a step by the root of the mean squared gradient: of ``each`` number, or
+    ``uniform``, by the largest of the parameter's, which keeps the step as smooth as the gradient
+    (Nicolet et al. 2021, for ``field.smoothness``)."""
     unit_gradient: bool = True
     """Normalise the gradient's length in every step. Otherwise a view that shows only a few cells
     of a deep layer, whose Grams are mostly noise, throws the field off. Not in the paper."""

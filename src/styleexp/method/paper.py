@@ -20,6 +20,7 @@ import torch
 from styleexp.method.base import Method, Result, State, Step, displaced
 from styleexp.method.fields import Field, check_field, zero_mean
 from styleexp.method.gram_cache import uncached
+from styleexp.method.large_steps import AdamUniform
 from styleexp.method.masks import masked
 from styleexp.method.scene import Cache, PaperScene, Parts, prepare
 from styleexp.method.stepping import (
@@ -66,8 +67,11 @@ class PaperLoop(Method[PaperScene]):
             bound=subject.bound * (1.0 if scene.base is None else settings.field.learned),
         )
         field.to(subject.surface.vertices.device)
+        field.connect(subject.surface.faces)
         check_field(field, subject.surface.vertices, subject.bound)
-        return State(field, torch.optim.Adam(field.parameters(), lr=settings.optim.rate))
+        kinds = {"each": torch.optim.Adam, "uniform": AdamUniform}
+        kind = kinds[settings.optim.second_moment]
+        return State(field, kind(field.parameters(), lr=settings.optim.rate))
 
     def optimise(self, scene: PaperScene, state: State) -> Iterator[Step]:
         """Run the remaining steps, yielding after each; ``state`` may be saved between them."""

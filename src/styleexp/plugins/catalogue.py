@@ -20,6 +20,7 @@ from styleexp.method.options import (
     NeighbourConfig,
     SlicedConfig,
     StyleConfig,
+    VertexConfig,
 )
 from styleexp.plugins.loggers.options import MLflowConfig, TensorBoardConfig
 from styleexp.plugins.spec import Spec
@@ -199,15 +200,15 @@ def _fourier_mlp(config: FieldConfig, **given: Any) -> Field:
     return FourierMLP(config, given["generator"], given["sigma"], given["bound"])
 
 
-def _vertex(config: FieldConfig, **given: Any) -> Field:
+def _vertex(config: VertexConfig, **given: Any) -> Field:
     from styleexp.method.fields import VertexField
 
-    return VertexField(len(given["points"]), given["bound"])
+    return VertexField(len(given["points"]), given["bound"], config.smoothness)
 
 
 FIELDS = _named(
     Spec("fourier_mlp", "an MLP on random Fourier features (Sec. 3.2)", FieldConfig, _fourier_mlp),
-    Spec("vertex", "a free displacement per vertex, no network (baseline)", FieldConfig, _vertex),
+    Spec("vertex", "a free displacement per vertex, no network (baseline)", VertexConfig, _vertex),
 )
 
 
