@@ -262,7 +262,10 @@ class NeighbourConfig(CellLossConfig):
     cells: int = option(2048, between=(16, 65_536))
     """Most cells of a layer that are compared: of the views of a step, drawn anew in each, and of
     the style's bank. Time grows with the square."""
-    completeness: float = option(1.0, between=(0.0, 1000.0))
+    block_weights: list[float] = option(factory=lambda: [0.3, 1.0, 2.0, 2.0, 0.5])
+    """One weight per VGG block, for the layers in it. Chosen by looking at bubbles on the critter
+    from its bare surface: with those of ``gram``, which favour the deep blocks, few appear."""
+    completeness: float = option(4.0, between=(0.0, 1000.0))
     """Weight of the other direction, from every cell of the style to the nearest of the result,
     which keeps the result from using the plainest cells alone (Simakov et al. 2008). 0: off."""
 
