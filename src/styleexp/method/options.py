@@ -122,8 +122,8 @@ class VertexConfig(FieldConfig):
     name: str = "vertex"
     smoothness: float = option(0.0, between=(0.0, 1e6))
     """lambda of large steps (Nicolet et al. 2021): what is learned is u = (I + lambda L) x, so that
-    a step moves neighbours alike, over about the square root of lambda edges. They use 19 and more,
-    with ``optim.second_moment=uniform``. 0: off."""
+    a step moves neighbours alike, over about the square root of lambda edges. u is larger than x:
+    raise ``optim.rate`` with it, to 0.3 for 2. 0: off."""
 
 
 @dataclass
