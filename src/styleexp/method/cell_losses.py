@@ -169,7 +169,7 @@ class CellLoss(LayerLoss):
 
 class SlicedLoss(CellLoss):
     """Sliced Wasserstein distance of the features' distributions (Heitz et al. 2021, *A Sliced
-    Wasserstein Loss for Neural Texture Synthesis*, Eqs. 3 and 4)."""
+    Wasserstein Loss for Neural Texture Synthesis*)."""
 
     config: SlicedConfig
 
@@ -227,7 +227,7 @@ class NeighbourLoss(CellLoss):
     nearest of the result (`NeighbourConfig.completeness`).
 
     Features are relative to the style's mean: cells after the ReLU all lie in one corner, at small
-    angles (Mechrez et al. 2018, *The Contextual Loss*, Eq. 2).
+    angles (Mechrez et al. 2018, *The Contextual Loss*).
     """
 
     config: NeighbourConfig

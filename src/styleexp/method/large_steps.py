@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Diffusion:
-    """x = (I + lambda L)^-1 u (Eq. 10), where L is the combinatorial Laplacian of the mesh's edges:
+    """x = (I + lambda L)^-1 u, where L is the combinatorial Laplacian of the mesh's edges:
     a vertex's degree, less 1 for each neighbour.
 
     Factorised once; every solution and every gradient, for which the symmetric system is solved
@@ -73,7 +73,7 @@ class _Solve(torch.autograd.Function):
 
 
 class AdamUniform(torch.optim.Optimizer):
-    """Adam whose second moment is the largest of its parameter (Sec. 4.2 of the paper): all of its
+    """Adam whose second moment is the largest of its parameter (the paper calls it uniform): all of its
     entries are divided by the same number, so that a smooth gradient makes a smooth step."""
 
     def __init__(
