@@ -73,7 +73,7 @@ class _Solve(torch.autograd.Function):
 
 
 class AdamUniform(torch.optim.Optimizer):
-    """Adam whose second moment is the largest of its parameter (the paper calls it uniform): all of its
+    """Adam whose second moment is the largest of its parameter, as in the paper: all of its
     entries are divided by the same number, so that a smooth gradient makes a smooth step."""
 
     def __init__(
