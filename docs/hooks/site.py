@@ -19,7 +19,7 @@ PACKAGE = ROOT / "src" / "styleexp"
 
 API = {
     "The method": (
-        "api", "method.base", "method.paper", "method.stepping", "method.subject", "method.scene", "method.options", "method.fields", "method.height_maps", "method.surface", "method.views", "method.viewer", "method.losses", "method.targets", "method.relief", "method.refinement", "config.schema", "config.build", "method.baselines", "method.baselines.geometric_textures",
+        "api", "method.base", "method.paper", "method.stepping", "method.subject", "method.scene", "method.options", "method.fields", "method.large_steps", "method.height_maps", "method.surface", "method.views", "method.viewer", "method.losses", "method.cell_losses", "method.targets", "method.relief", "method.refinement", "config.schema", "config.build", "method.baselines", "method.baselines.geometric_textures",
     ),
     "Synthesis on the surface": ("method.synthesis", "method.synthesis.method", "method.synthesis.shape", "method.synthesis.exemplar",
                                  "method.synthesis.direction", "method.synthesis.walk", "method.synthesis.optimise", "method.synthesis.room"),

@@ -17,7 +17,13 @@ from styleexp.inputs import meshes, shapes
 from styleexp.method.base import Method, displaced
 from styleexp.method.fields import Field, check_field
 from styleexp.method.losses import GramLoss, Loss
-from styleexp.method.options import FieldConfig, LossConfig
+from styleexp.method.options import (
+    FieldConfig,
+    LossConfig,
+    NeighbourConfig,
+    SlicedConfig,
+    VertexConfig,
+)
 from styleexp.method.paper import PaperLoop
 from styleexp.method.scene import Parts
 from styleexp.method.stepping import gradient_norm
@@ -61,9 +67,21 @@ def test_the_gram_loss(encoder, masked):
     assert testing.check_loss(GramLoss(LossConfig(masked=masked), encoder))
 
 
+@pytest.mark.parametrize("masked", [True, False])
+@pytest.mark.parametrize("config", [SlicedConfig, NeighbourConfig])
+def test_the_losses_of_cells(encoder, config, masked):
+    loss = plugins.build("loss", config(masked=masked, cells=1024), encoder=encoder)
+    assert set(testing.check_loss(loss).values()) == {"passed"}
+
+
 @pytest.mark.parametrize("name", FIELDS)
 def test_the_builtin_fields(name):
-    build = functools.partial(plugins.build, "field", FieldConfig(name=name))
+    build = functools.partial(plugins.build, "field", FIELDS[name].config(name=name))
+    assert set(testing.check_field(build).values()) == {"passed"}
+
+
+def test_the_vertex_field_with_large_steps():
+    build = functools.partial(plugins.build, "field", VertexConfig(smoothness=5.0))
     assert set(testing.check_field(build).values()) == {"passed"}
 
 

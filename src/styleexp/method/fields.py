@@ -11,10 +11,11 @@ import torch
 from torch import nn
 from torch.autograd.function import once_differentiable
 
+from styleexp.method.large_steps import Diffusion
 from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Int
     from torch import Tensor
 
     from styleexp.method.options import FieldConfig
@@ -30,6 +31,11 @@ class Field(nn.Module, ABC):
     Its parameters are learned and its buffers are not; both are checkpointed. All random numbers
     come from the factory's ``generator``. It is moved with ``to(device)``.
     """
+
+    def connect(self, faces: Int[Tensor, "faces 3"]) -> None:
+        """Take note of the source's faces, for a field that uses a vertex's neighbours. Called once
+        before the first evaluation, and not checkpointed. The default ignores them."""
+        return
 
     @abstractmethod
     def forward(
@@ -182,12 +188,23 @@ class _LinearRelu(torch.autograd.Function):
 
 class VertexField(Field):
     """A free displacement per vertex, in [-bound, bound], from zero: the field without the
-    network."""
+    network.
 
-    def __init__(self, vertices: int, bound: float):
+    With ``smoothness`` the parameter is not x but u = (I + smoothness L) x
+    (`large_steps.Diffusion`), and the displacement is bound tanh(x).
+    """
+
+    def __init__(self, vertices: int, bound: float, smoothness: float = 0.0):
         super().__init__()
         self.bound = bound
+        self.smoothness = smoothness
         self.latent = nn.Parameter(torch.zeros(vertices))
+        self._diffusion: Diffusion | None = None
+
+    def connect(self, faces: Int[Tensor, "faces 3"]) -> None:
+        """Factorise the system of these faces, if there is any ``smoothness``."""
+        if self.smoothness > 0:
+            self._diffusion = Diffusion(faces, len(self.latent), self.smoothness)
 
     def forward(
         self,
@@ -195,10 +212,16 @@ class VertexField(Field):
         opened: float = 1.0,
         precision: torch.dtype = torch.float32,
     ) -> Float[Tensor, " vertices"]:
-        """See `Field`; ``opened`` and ``precision`` have no effect."""
+        """See `Field`; ``opened`` and ``precision`` have no effect. Raises `ValueError` for another
+        number of points, or with ``smoothness`` before `connect`."""
         if len(points) != len(self.latent):
             raise ValueError(f"the field has {len(self.latent)} vertices, got {len(points)} points")
-        return self.bound * torch.tanh(self.latent)
+        latent: Tensor = self.latent
+        if self.smoothness > 0:
+            if self._diffusion is None:
+                raise ValueError("field.smoothness needs the faces: call connect(faces) first")
+            latent = self._diffusion(latent)
+        return self.bound * torch.tanh(latent)
 
 
 def zero_mean(

@@ -18,6 +18,8 @@ from styleexp.encoders.vgg import VGG
 from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
+    from typing import Self
+
     from jaxtyping import Bool, Float
     from torch import Tensor
 
@@ -48,6 +50,12 @@ class Loss(ABC):
         """The loss to use for this style; called once, before anything is described."""
         return self
 
+    def for_step(self, generator: torch.Generator) -> Loss:
+        """The loss to use in one step, for losses with random parts: what they draw comes from
+        ``generator``, which depends on the run's seed and the step alone, so that a resumed run
+        draws the same. Called in every step, and once for the style's bank of views."""
+        return self
+
     @abstractmethod
     def describe(self, seen: Images) -> Statistics:
         """Statistics of views, averaged over them; differentiable in ``seen.image``, of shape
@@ -55,8 +63,13 @@ class Loss(ABC):
 
         A statistic for which no cell counts, such as a masked one without foreground
         (``seen.coverage``), is all zeros, never NaN. A bank of views is described in several calls,
-        and the statistics of all calls are averaged with equal weight.
+        whose statistics `pooled` makes one.
         """
+
+    def pooled(self, batches: Sequence[Statistics]) -> Statistics:
+        """One description of several batches of views that count equally. The default is the mean
+        of each statistic."""
+        return [torch.stack(layer).mean(0) for layer in zip(*batches, strict=True)]
 
     @abstractmethod
     def distance(
@@ -164,23 +177,37 @@ def layer_masks(
     return masks
 
 
-class GramLoss(Loss):
-    """Distances of the Gram matrices of an encoder's layers (Eqs. 3-8), one per style layer."""
+class LayerLoss(Loss):
+    """A loss of an encoder's layers, weighted by their block and masked as configured."""
 
     def __init__(self, config: LossConfig, encoder: Encoder):
         self.config = config
         self.masked = config.masked not in (False, "pictures")
         self.encoder = encoder
         self.layers = encoder.resolve(config.layers)
-        self.weights = [config.block_weights[block_of(name) - 1] for name in self.layers]
+        self.weights = [
+            config.block_weights[block_of(name, config.name) - 1] for name in self.layers
+        ]
 
-    def for_style(self, style: Style) -> GramLoss:
+    def for_style(self, style: Style) -> Self:
         """Decide ``loss.masked=pictures`` for this style."""
         if self.config.masked != "pictures":
             return self
         loss = copy.copy(self)
         loss.masked = style.picture is not None
         return loss
+
+    def _masks(
+        self, seen: Images, cells: Sequence[tuple[int, int]]
+    ) -> Sequence[Bool[Tensor, "n rows columns"] | None]:
+        """Masks of the cells that count, for layers of these sizes."""
+        if not self.masked:
+            return [None] * len(cells)
+        return layer_masks(seen.coverage, cells, self.config.erosion)
+
+
+class GramLoss(LayerLoss):
+    """Distances of the Gram matrices of an encoder's layers (Eqs. 3-8), one per style layer."""
 
     def describe(self, seen: Images) -> Statistics:
         """One Gram per style layer, over the foreground only if configured."""
@@ -207,14 +234,6 @@ class GramLoss(Loss):
         masks = self._masks(seen, [(each.shape[2], each.shape[3]) for each in found])
         how = self.config.normalisation
         return [gram_matrix(each, mask, how) for each, mask in zip(found, masks, strict=True)]
-
-    def _masks(
-        self, seen: Images, cells: Sequence[tuple[int, int]]
-    ) -> Sequence[Bool[Tensor, "n rows columns"] | None]:
-        """Masks of the cells that count, for layers of these sizes."""
-        if not self.masked:
-            return [None] * len(cells)
-        return layer_masks(seen.coverage, cells, self.config.erosion)
 
     def distance(
         self, found: Statistics, target: Statistics, scales: list[Tensor]
@@ -246,13 +265,13 @@ class GramLoss(Loss):
         return divisors
 
 
-def block_of(layer: str) -> int:
+def block_of(layer: str, loss: str = "gram") -> int:
     """VGG block of a layer named ``convB_I``, 1 to 5. Raises `UserError` for another name."""
     match = re.match(r"conv([1-5])_", layer)
     if match is None:
         raise UserError(
-            f"loss=gram weighs layers by their block: name them convB_I with B from 1 to 5, not "
-            f"'{layer}'."
+            f"loss={loss} weighs layers by their block: name them convB_I with B from 1 to 5, "
+            f"not '{layer}'."
         )
     return int(match[1])
 

@@ -116,6 +116,17 @@ class FieldConfig:
 
 
 @dataclass
+class VertexConfig(FieldConfig):
+    """A free displacement per vertex (`styleexp.method.fields.VertexField`)."""
+
+    name: str = "vertex"
+    smoothness: float = option(0.0, between=(0.0, 1e6))
+    """lambda of large steps (Nicolet et al. 2021): what is learned is u = (I + lambda L) x, so that
+    a step moves neighbours alike, over about the square root of lambda edges. u is larger than x:
+    raise ``optim.rate`` with it, to 0.3 for 2. 0: off."""
+
+
+@dataclass
 class LocalViewsConfig:
     """Local views (Sec. 3.3.1, Eq. 2)."""
 
@@ -226,6 +237,40 @@ class LossConfig:
 
 
 @dataclass
+class CellLossConfig(LossConfig):
+    """Options of the losses that compare cells of features (`styleexp.method.cell_losses`)."""
+
+    cells: int = option(4096, between=(16, 65_536))
+    """Most cells of a layer that are compared: of the views of a step, drawn anew in each, and of
+    the style's bank."""
+
+
+@dataclass
+class SlicedConfig(CellLossConfig):
+    """Sliced Wasserstein distances (Heitz et al. 2021)."""
+
+    name: str = "sliced"
+    directions: int = option(128, between=(1, 4096))
+    """Random directions that features are projected on, drawn anew in every step for each layer."""
+
+
+@dataclass
+class NeighbourConfig(CellLossConfig):
+    """Cosine distances to the nearest cell of the style (Kolkin et al. 2022)."""
+
+    name: str = "neighbour"
+    cells: int = option(2048, between=(16, 65_536))
+    """Most cells of a layer that are compared: of the views of a step, drawn anew in each, and of
+    the style's bank. Time grows with the square."""
+    block_weights: list[float] = option(factory=lambda: [0.3, 1.0, 2.0, 2.0, 0.5])
+    """One weight per VGG block, for the layers in it. Chosen by looking at bubbles on the critter
+    from its bare surface: with those of ``gram``, which favour the deep blocks, few appear."""
+    completeness: float = option(4.0, between=(0.0, 1000.0))
+    """Weight of the other direction, from every cell of the style to the nearest of the result,
+    which keeps the result from using the plainest cells alone (Simakov et al. 2008). 0: off."""
+
+
+@dataclass
 class OptimConfig:
     """Adam and its learning rate (Sec. 4.1)."""
 
@@ -241,6 +286,10 @@ class OptimConfig:
     the rate is multiplied and the decay interval divided by the same factor, so that a short run
     gets as far as a long one; at most tenfold. null: no rescaling."""
     seed: int = 0
+    second_moment: str = option("each", choices=("each", "uniform"))
+    """Adam divides a step by the root of the mean squared gradient: of ``each`` number, or
+    ``uniform``, by the largest of the parameter's, which keeps the step as smooth as the gradient
+    (Nicolet et al. 2021, for ``field.smoothness``)."""
     unit_gradient: bool = True
     """Normalise the gradient's length in every step. Otherwise a view that shows only a few cells
     of a deep layer, whose Grams are mostly noise, throws the field off. Not in the paper."""

@@ -20,6 +20,7 @@ import torch
 from styleexp.method.base import Method, Result, State, Step, displaced
 from styleexp.method.fields import Field, check_field, zero_mean
 from styleexp.method.gram_cache import uncached
+from styleexp.method.large_steps import AdamUniform
 from styleexp.method.masks import masked
 from styleexp.method.scene import Cache, PaperScene, Parts, prepare
 from styleexp.method.stepping import (
@@ -29,6 +30,7 @@ from styleexp.method.stepping import (
     normalise_gradient,
 )
 from styleexp.method.surface import unfolded
+from styleexp.method.targets import in_step
 from styleexp.method.views import step_generator
 
 if TYPE_CHECKING:
@@ -65,12 +67,15 @@ class PaperLoop(Method[PaperScene]):
             bound=subject.bound * (1.0 if scene.base is None else settings.field.learned),
         )
         field.to(subject.surface.vertices.device)
+        field.connect(subject.surface.faces)
         check_field(field, subject.surface.vertices, subject.bound)
-        return State(field, torch.optim.Adam(field.parameters(), lr=settings.optim.rate))
+        kinds = {"each": torch.optim.Adam, "uniform": AdamUniform}
+        kind = kinds[settings.optim.second_moment]
+        return State(field, kind(field.parameters(), lr=settings.optim.rate))
 
     def optimise(self, scene: PaperScene, state: State) -> Iterator[Step]:
         """Run the remaining steps, yielding after each; ``state`` may be saved between them."""
-        subject, loss, options = scene.subject, scene.loss, scene.subject.settings.loss
+        subject, options = scene.subject, scene.subject.settings.loss
         optim, surface = subject.settings.optim, subject.surface
         first: float | None = None
         while state.step < optim.steps:
@@ -82,6 +87,7 @@ class PaperLoop(Method[PaperScene]):
             generated = surface.vertices + displacement[:, None] * surface.normals
             if optim.renormalize:
                 generated = generated / generated.detach().norm(dim=1).max()
+            loss = in_step(scene.loss, optim.seed, state.step)
             whole, local = scene.viewer(generated, state.step)
             whole_target, local_target = scene.target(state.step)
             loss_global = loss.distance(loss.describe(whole), whole_target, scene.scales[0])

@@ -79,6 +79,7 @@ def prepare(subject: Subject, parts: Parts, cache: Cache) -> PaperScene:
     base, notes = base_of(subject)
     settings, surface, style = subject.settings, subject.surface, subject.style
     renderer, loss = parts.renderer, parts.loss.for_style(style)
+    for_bank = targets.in_step(loss, settings.optim.seed, targets.BANK_STEP)
     grey = foreground_mean(settings.shading, settings.views, renderer, surface)
     shading = choose_shading(settings.shading, grey)
     lights = settings.shading.lights if style.mesh is not None else 1
@@ -101,7 +102,7 @@ def prepare(subject: Subject, parts: Parts, cache: Cache) -> PaperScene:
         def make() -> Pair:
             doing(f"rendering views of {len(mesh.faces):,} faces for the target")
             bank = settings.loss.bank_views
-            return targets.mesh_statistics(loss, viewer(mesh, scale), mesh.vertices, bank)
+            return targets.mesh_statistics(for_bank, viewer(mesh, scale), mesh.vertices, bank)
 
         device = str(mesh.vertices.device)
         about = [mesh.vertices, mesh.faces, scale, lights, shading, device, style.mesh is None]
@@ -126,7 +127,7 @@ def prepare(subject: Subject, parts: Parts, cache: Cache) -> PaperScene:
             bank = targets.whole_image_bank(picture, settings)
         else:
             bank = targets.image_bank(picture, settings, subject.unit)
-        target = targets.FixedTarget(*targets.mean_statistics(loss, bank))
+        target = targets.FixedTarget(*targets.mean_statistics(for_bank, bank))
 
     goal, own = target(0), described(surface, 1.0)(0)
     check_seen("source", own, subject)
@@ -138,7 +139,7 @@ def prepare(subject: Subject, parts: Parts, cache: Cache) -> PaperScene:
         loss=loss,
         target=target,
         base=base,
-        scales=(loss.scales(goal[0], own[0]), loss.scales(goal[1], own[1])),
+        scales=(for_bank.scales(goal[0], own[0]), for_bank.scales(goal[1], own[1])),
         encoder=parts.encoder,
     )
 

@@ -26,6 +26,8 @@ BANK_STEP = 1_000_000
 """First step number of the style bank's draws, so that no training step draws the same."""
 OWN_VIEWS = 2_000_000
 """First step number of the style's views with ``loss.target=own_views``."""
+LOSS_STREAM = 8
+"""Stream of the random numbers that a loss draws (`losses.Loss.for_step`)."""
 
 
 class StyleTarget(Protocol):
@@ -59,17 +61,23 @@ class RenderedTarget:
     @torch.no_grad()
     def __call__(self, step: int) -> tuple[Statistics, Statistics]:
         """Statistics of the style mesh at this step's views."""
+        loss = in_step(self.loss, self.viewer.seed, step)
         whole, local = self.viewer(self.vertices, step + self.later)
-        return self.loss.describe(whole), self.loss.describe(local)
+        return loss.describe(whole), loss.describe(local)
+
+
+def in_step(loss: Loss, seed: int, step: int) -> Loss:
+    """The loss to use in this step of a run with this seed; see `losses.Loss.for_step`."""
+    return loss.for_step(views.step_generator(seed, step, stream=LOSS_STREAM))
 
 
 def mean_statistics(
     loss: Loss, batches: Iterator[tuple[Images, Images]]
 ) -> tuple[Statistics, Statistics]:
-    """Statistics of global and local views, averaged over batches."""
+    """Statistics of global and local views, pooled over batches."""
     with torch.no_grad():
         pairs = [(loss.describe(whole), loss.describe(local)) for whole, local in batches]
-    return _mean([g for g, _ in pairs]), _mean([g for _, g in pairs])
+    return loss.pooled([g for g, _ in pairs]), loss.pooled([g for _, g in pairs])
 
 
 def mesh_statistics(
@@ -183,7 +191,3 @@ def picture_windows(
 def _mirrored(start: int, count: int, size: int, device: torch.device) -> Tensor:
     index = (start + torch.arange(count, device=device)) % (2 * size)
     return torch.where(index < size, index, 2 * size - 1 - index)
-
-
-def _mean(batches: list[Statistics]) -> Statistics:
-    return [torch.stack(layer).mean(0) for layer in zip(*batches, strict=True)]

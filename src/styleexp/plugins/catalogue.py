@@ -14,7 +14,14 @@ from styleexp.method.baselines.options import (
     GeometricTexturesConfig,
     SynthesisConfig,
 )
-from styleexp.method.options import FieldConfig, LossConfig, StyleConfig
+from styleexp.method.options import (
+    FieldConfig,
+    LossConfig,
+    NeighbourConfig,
+    SlicedConfig,
+    StyleConfig,
+    VertexConfig,
+)
 from styleexp.plugins.loggers.options import MLflowConfig, TensorBoardConfig
 from styleexp.plugins.spec import Spec
 from styleexp.renderers.options import (
@@ -193,15 +200,15 @@ def _fourier_mlp(config: FieldConfig, **given: Any) -> Field:
     return FourierMLP(config, given["generator"], given["sigma"], given["bound"])
 
 
-def _vertex(config: FieldConfig, **given: Any) -> Field:
+def _vertex(config: VertexConfig, **given: Any) -> Field:
     from styleexp.method.fields import VertexField
 
-    return VertexField(len(given["points"]), given["bound"])
+    return VertexField(len(given["points"]), given["bound"], config.smoothness)
 
 
 FIELDS = _named(
     Spec("fourier_mlp", "an MLP on random Fourier features (Sec. 3.2)", FieldConfig, _fourier_mlp),
-    Spec("vertex", "a free displacement per vertex, no network (baseline)", FieldConfig, _vertex),
+    Spec("vertex", "a free displacement per vertex, no network (baseline)", VertexConfig, _vertex),
 )
 
 
@@ -217,8 +224,32 @@ def _clip_loss(config: LossConfig, *, encoder: Encoder) -> Loss:
     return ClipLoss(encoder)
 
 
+def _sliced(config: SlicedConfig, *, encoder: Encoder) -> Loss:
+    from styleexp.method.cell_losses import SlicedLoss
+
+    return SlicedLoss(config, encoder)
+
+
+def _neighbour(config: NeighbourConfig, *, encoder: Encoder) -> Loss:
+    from styleexp.method.cell_losses import NeighbourLoss
+
+    return NeighbourLoss(config, encoder)
+
+
 LOSSES = _named(
     Spec("gram", "squared distances of Gram matrices (Sec. 3.3)", LossConfig, _gram),
+    Spec(
+        "sliced",
+        "sliced Wasserstein distances of the features (Heitz et al. 2021)",
+        SlicedConfig,
+        _sliced,
+    ),
+    Spec(
+        "neighbour",
+        "cosine distance of each feature cell to the style's nearest (Kolkin et al. 2022)",
+        NeighbourConfig,
+        _neighbour,
+    ),
     Spec("clip", "cosine of CLIP's embeddings, as in Text2Mesh (baseline)", LossConfig, _clip_loss),
 )
 

@@ -24,10 +24,20 @@ def points(count: int = 300) -> torch.Tensor:
     return torch.nn.functional.normalize(found, dim=1)
 
 
+def faces(of: torch.Tensor) -> torch.Tensor:
+    """Triangles between points on a sphere: those of their convex hull."""
+    from scipy.spatial import ConvexHull
+
+    return torch.from_numpy(ConvexHull(of.numpy()).simplices).long()
+
+
 def made(build: Build, seed: int = 0) -> Field:
-    """A field for `points`."""
+    """A field for `points`, connected by `faces`."""
     generator = torch.Generator().manual_seed(seed)
-    return build(points=points(), generator=generator, sigma=5.0, bound=BOUND)
+    field = build(points=points(), generator=generator, sigma=5.0, bound=BOUND)
+    if isinstance(field, Field):
+        field.connect(faces(points()))
+    return field
 
 
 def _learned(build: Build) -> Field:

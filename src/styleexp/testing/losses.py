@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from styleexp.method.losses import Loss
 from styleexp.method.viewer import Images
 from styleexp.testing import checks
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from styleexp.method.losses import Loss, Statistics
+    from styleexp.method.losses import Statistics
 
 SIZE = 96
 """Side of the checks' images in pixels."""
@@ -58,11 +59,53 @@ def the_same_images_give_the_same_numbers(loss: Loss) -> None:
 
 
 def the_order_of_images_does_not_matter(loss: Loss) -> None:
-    """Statistics are averages over images."""
+    """Statistics are averages over images. Those of a loss that pools them otherwise may differ,
+    but not their distance."""
     seen = images(0)
     turned = Images(seen.image.flip(0), seen.coverage.flip(0))
-    for one, other in zip(loss.describe(seen), loss.describe(turned), strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-6)
+    ordered, reordered = loss.describe(seen), loss.describe(turned)
+    if type(loss).pooled is Loss.pooled:
+        for one, other in zip(ordered, reordered, strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-6)
+    target = loss.describe(images(1))
+    one, other = (_distance(loss, each, target, target) for each in (ordered, reordered))
+    torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-6)
+
+
+def several_descriptions_make_one(loss: Loss) -> None:
+    """Pooled descriptions have the shapes of one, and are finite. One alone stays as it is; two
+    that are alike, or whose order changes, are hardly any distance from one."""
+    one, other = loss.describe(images(0)), loss.describe(images(1))
+    alone, both = loss.pooled([one]), loss.pooled([one, other])
+    for each in (alone, both):
+        assert [x.shape for x in each] == [x.shape for x in one], "shapes differ"
+        assert all(bool(x.isfinite().all()) for x in each), "not finite"
+    apart = float(_distance(loss, other, one, other))
+    for name, pooled, target in (
+        ("one", alone, one),
+        ("two equal ones", loss.pooled([one, one]), one),
+        ("two in another order", loss.pooled([other, one]), both),
+    ):
+        moved = float(_distance(loss, pooled, target, other))
+        assert abs(moved) <= 0.5 * apart, f"{name} pooled: {moved}, where others are {apart} apart"
+
+
+def a_step_has_a_loss_of_its_own(loss: Loss) -> None:
+    """Equal generators give the same bits, and the loss itself doesn't change by it."""
+    before = loss.describe(images(0))
+    one, other = (loss.for_step(torch.Generator().manual_seed(3)) for _ in range(2))
+    loss.for_step(torch.Generator().manual_seed(4))
+    target = loss.describe(images(1))
+    described = [each.describe(images(0)) for each in (one, other)]
+    for first, second in zip(*described, strict=True):
+        assert torch.equal(first, second), "equal generators, other statistics"
+    values = [
+        _distance(each, own, target, target)
+        for each, own in zip((one, other), described, strict=True)
+    ]
+    assert torch.equal(*values), "equal generators, another distance"
+    for first, second in zip(before, loss.describe(images(0)), strict=True):
+        assert torch.equal(first, second), "for_step changes the loss itself"
 
 
 def equal_statistics_are_no_distance_apart(loss: Loss) -> None:
@@ -116,6 +159,8 @@ CHECKS: tuple[Callable[[Loss], None], ...] = (
     statistics_keep_their_shapes,
     the_same_images_give_the_same_numbers,
     the_order_of_images_does_not_matter,
+    several_descriptions_make_one,
+    a_step_has_a_loss_of_its_own,
     equal_statistics_are_no_distance_apart,
     a_step_down_the_gradient_lowers_the_distance,
     images_that_show_nothing_do_no_harm,
