@@ -43,7 +43,7 @@ def method_of(config: Config) -> Method[Any]:
     return PaperLoop(
         parts=Parts(renderer, encoder, plugins.build("loss", config.loss, encoder=encoder)),
         field=partial(plugins.build, "field", config.field),
-        separates_relief=config.field.start == "synthesis",
+        separates_relief=separates(config),
         cache=cache_of(config, encoder),
     )
 
@@ -55,6 +55,13 @@ def subject_of(config: Config, separate: bool = False) -> Subject:
     style = sources.load_style(config.style)
     as_tone = config.baseline is None
     return measure(config, source, style, device, separate=separate, as_tone=as_tone)
+
+
+def separates(config: Config) -> bool:
+    """Whether the run's method separates a style mesh's relief from its shape."""
+    if config.baseline is not None:
+        return plugins.build("baseline", config.baseline).separates_relief
+    return config.field.start == "synthesis"
 
 
 def cache_of(config: Config, encoder: Any) -> Cache:

@@ -304,6 +304,7 @@ def _write_results(
 ) -> tuple[list[Path], dict[str, float]]:
     """Write, draw and measure the result; return the files to name to the user, and the metrics."""
     from styleexp import plugins
+    from styleexp.experiments.ratings import verdict
     from styleexp.runs import previews
 
     for name in ("result.ply", "result.obj", "result.glb"):
@@ -321,6 +322,8 @@ def _write_results(
     folder.write_json("metrics.json", measured)
     shown = [name for name in SHOWN_METRICS if name in measured]
     print("  ".join(f"{name} {measured[name]:.3g}" for name in shown))
+    if (told := verdict(measured)) is not None:
+        print(told)
     if config.preview.name == "pyrender":
         renderer = plugins.build("renderer", config.renderer)
         written += previews.write_check(result, renderer, config, folder.write)

@@ -5,12 +5,16 @@ Every finished run is measured with ``measure``.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
+import torch
 
-from styleexp.experiments.metrics.shape import content, spike
+from styleexp.experiments import ratings
+from styleexp.experiments.metrics.likeness import Bank, bank_of, likeness
+from styleexp.experiments.metrics.shape import bend, content, spike
 from styleexp.experiments.metrics.style import (
     Looks,
     judged,
@@ -21,7 +25,9 @@ from styleexp.experiments.metrics.style import (
 )
 from styleexp.inputs import meshes
 from styleexp.method.patches import Relief, closest, relief_of_mesh, relief_of_result
-from styleexp.method.subject import pattern_unit
+from styleexp.method.subject import Subject, pattern_unit
+from styleexp.method.subject import measure as measure_subject
+from styleexp.method.synthesis.method import exemplar_of_style
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -72,6 +78,10 @@ def load_judge(name: str | None, windows: int) -> Judge | None:
     return None if name is None else Judge(name, load_encoder(name), windows)
 
 
+Banks: TypeAlias = "dict[object, Bank | None]"
+"""Patches of the styles measured so far; None for one without relief."""
+
+
 def measure(
     config: Config,
     source: meshes.Mesh,
@@ -79,18 +89,31 @@ def measure(
     vertices: Float[np.ndarray, "vertices 3"],
     faces: Int[np.ndarray, "faces 3"],
     judge: Judge | None,
+    banks: Banks | None = None,
 ) -> dict[str, float]:
     """All metrics of a result in its source's frame; without a judge, only those that don't need
-    one.
+    one. ``banks`` keeps the styles' patches for the next call.
 
-    ``style_distance`` is 0 for the style itself and 1 for no style at all (``metrics.style``).
-    ``relief_distance`` compares without a neural network. ``relief_rms`` is in radii of the
-    normalised source, and ``relief_share`` is its ratio to the style mesh's. For the content
-    metrics, see ``metrics.shape``.
+    ``match`` and ``craft`` estimate ratings from 1 to 5 (`ratings`). ``likeness`` is how much of
+    the style the surface carries, 0 to 1, and ``coverage`` the share of it that carries at least
+    half (`likeness`), of all and of five regions. ``style_distance`` is 0 for the style itself and
+    1 for no style at all (``metrics.style``). ``relief_distance`` compares without a neural
+    network. ``relief_rms`` is in radii of the normalised source, and ``relief_share`` is its ratio
+    to the style mesh's. For the content metrics, see ``metrics.shape``.
     """
     unit = pattern_unit(config.style, source, style)
     found: dict[str, float] = {}
     relief = relief_of_result(source, vertices, faces, unit)
+    bank = bank_for(config, source, style, {} if banks is None else banks)
+    if bank is not None:
+        base = raised(source, vertices, faces)
+        local = likeness(bank, base, unit)
+        found["likeness"] = float(local.carried.mean())
+        found["coverage"] = local.coverage
+        found |= {f"coverage_{where}": share for where, share in local.by_region().items()}
+        found["match"] = ratings.match(found["likeness"])
+    shape = content(source, vertices, faces) | {"bend": bend(vertices, faces)}
+    found["craft"] = ratings.craft(shape["silhouette_iou"], shape["bend"])
     found["relief_rms"] = _rms(relief.height)
     if style.mesh is not None:
         found["relief_share"] = found["relief_rms"] / max(
@@ -103,9 +126,39 @@ def measure(
         apart = relief_distance(looks, goal)
         if apart is not None:
             found["relief_distance"] = apart
-    return (
-        found | content(source, vertices, faces) | {"spike": spike(_moved(source, vertices, faces))}
+    return found | shape | {"spike": spike(_moved(source, vertices, faces))}
+
+
+def bank_for(config: Config, source: meshes.Mesh, style: Style, banks: Banks) -> Bank | None:
+    """The style's patches, from ``banks`` if they are there; None for a style without relief."""
+    unit = pattern_unit(config.style, source, style)
+    key = (repr(config.style), config.baseline is None, None if style.mesh else unit)
+    if key not in banks:
+        subject = style_subject(config, source, style)
+        banks[key] = None if subject.smooth else bank_of(exemplar_of_style(subject))
+    return banks[key]
+
+
+def style_subject(config: Config, source: meshes.Mesh, style: Style) -> Subject:
+    """What a run measures on its style, on the source as it is and without a mask."""
+    plain = copy.deepcopy(config)
+    plain.source.refine, plain.style.mask, plain.style.direction = "none", None, "auto"
+    as_tone = config.baseline is None
+    return measure_subject(
+        plain, source, style, torch.device("cpu"), separate=True, as_tone=as_tone
     )
+
+
+def raised(source: meshes.Mesh, vertices: np.ndarray, faces: np.ndarray) -> Relief:
+    """A result as heights above its source, in radii of the normalised source, no undulation
+    taken away."""
+    frame = meshes.normalisation(source.vertices)
+    result, own = frame.apply(vertices), frame.apply(source.vertices)
+    if np.array_equal(faces, source.faces):
+        base, normals = own, meshes.vertex_normals(own, faces)
+    else:
+        base, normals = closest(own, source.faces, result)
+    return Relief(base, faces, ((result - base) * normals).sum(axis=1))
 
 
 def _moved(source: meshes.Mesh, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from styleexp.config import build
 from styleexp.config.sources import load_source, load_style
-from styleexp.experiments.metrics import Judge, measure
+from styleexp.experiments.metrics import Banks, Judge, measure
 from styleexp.experiments.metrics.style import Looks, pattern_distance, relief_distance
 from styleexp.inputs import meshes
 from styleexp.inputs.style import Style
@@ -29,7 +30,7 @@ def measure_run(folder: Path, judge: Judge | None) -> dict[str, float]:
 
     Raises `UserError` if the folder isn't a run's, or its run isn't done.
     """
-    _, config, source, style, vertices, faces = _finished(folder)
+    _, config, source, style, vertices, faces = finished(folder)
     return measure(config, source, style, vertices, faces, judge)
 
 
@@ -46,6 +47,7 @@ def measure_board(folder: Path, judge: Judge, write: bool = False) -> dict[str, 
     rows: list[dict[str, Any]] = []
     results: list[tuple[dict[str, Any], Looks]] = []
     goals: dict[str, Looks] = {}
+    banks: Banks = {}
     contents: dict[str, str] = {}
     runs = sorted((at for at in finding.folders(folder) if (at / "run.json").is_file()), key=str)
     if not runs:
@@ -54,13 +56,13 @@ def measure_board(folder: Path, judge: Judge, write: bool = False) -> dict[str, 
         row: dict[str, Any] = {"run": str(run.relative_to(folder))}
         rows.append(row)
         try:
-            record, config, source, style, vertices, faces = _finished(run)
+            record, config, source, style, vertices, faces = finished(run)
         except UserError as error:
             row["status"] = str(error)
             continue
         name = _style_name(record, contents)
         row |= {"status": "done", "source": source.name, "style": name}
-        found = measure(config, source, style, vertices, faces, judge)
+        found = measure(config, source, style, vertices, faces, judge, banks)
         if write:
             records.RunFolder(run).write_json("metrics.json", found)
         row |= found
@@ -117,7 +119,7 @@ def unit_of(config: Config, source: meshes.Mesh, style: Style) -> float:
     return pattern_unit(config.style, source, style)
 
 
-def _finished(
+def finished(
     folder: Path,
 ) -> tuple[dict[str, Any], Config, meshes.Mesh, Style, np.ndarray, np.ndarray]:
     """Record, configuration, source, style and result of a finished run."""
@@ -127,7 +129,14 @@ def _finished(
         raise UserError(f"the run in '{folder}' is {status}, not done: there is no result yet.")
     config = origins.restored(run.record, folder, "measure")
     source, style = load_source(config.source), load_style(config.style)
-    return run.record, config, source, style, *read_result(folder / results.NAME, source)
+    path = folder / results.NAME
+    vertices, faces = read_result(path, source)
+    if config.source.refine != "none" and not np.array_equal(faces, source.faces):
+        refined = build.subject_of(config, build.separates(config)).source
+        again = read_result(path, refined)
+        if np.array_equal(again[1], refined.faces):
+            return run.record, config, refined, style, *again
+    return run.record, config, source, style, vertices, faces
 
 
 def read_result(path: Path, source: meshes.Mesh) -> tuple[np.ndarray, np.ndarray]:

@@ -133,6 +133,15 @@ def spike(displacement: Float[np.ndarray, " vertices"]) -> float:
     return float(np.percentile(np.abs(displacement), 99.9)) / root if root > 0 else 0.0
 
 
+def bend(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> float:
+    """99th percentile, over the edges, of the difference of the unit normals at an edge's ends: 0
+    for a smooth surface, up to 2 where it is crumpled."""
+    normals = meshes.vertex_normals(vertices, faces)
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    a, b = np.unique(edges, axis=0).T
+    return float(np.percentile(np.linalg.norm(normals[a] - normals[b], axis=1), 99))
+
+
 def self_intersections(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> float:
     """Fraction of faces that intersect another face without a shared vertex."""
     first, second = _near_pairs(vertices[faces])

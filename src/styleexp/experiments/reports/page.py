@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from styleexp.experiments.ratings import verdict
 from styleexp.experiments.reports import charts, glb, html
 from styleexp.experiments.reports import shown as shows
 from styleexp.runs import reading
@@ -24,6 +25,16 @@ STYLE_PIXELS = 720
 """Longer side of a style picture on the page, in pixels."""
 STILL_PIXELS = 1280
 MEANINGS = {
+    "match": "estimate of how raters rate the match with the style, from 1 to 5",
+    "craft": "estimate of how raters rate how clean it is, from 1 to 5",
+    "likeness": "how much of the style the surface carries, 0 to 1",
+    "coverage": "share of the surface that carries at least half of the style",
+    "coverage_outer": "the same of the third of the surface that is farthest out",
+    "coverage_top": "of the third at the top",
+    "coverage_bottom": "of the third at the bottom",
+    "coverage_front": "of the third in front",
+    "coverage_back": "of the third at the back",
+    "bend": "99th percentile of the bend at an edge; large where the surface is crumpled",
     "style_distance": "to the style, by an encoder not used in training; 0: the style, 1: no style",
     "relief_distance": "to the style's relief or a picture's brightness, no network; 0 is equal",
     "relief_rms": "RMS height of the relief, in radii of the source",
@@ -96,6 +107,7 @@ def build(run: Run, shown: Shown) -> str:
         assets=_assets(run),
         still=html.picture(run.folder / "preview.png", STILL_PIXELS),
         meanings=MEANINGS,
+        verdict=verdict(run.metrics),
         files=[(name, what) for name, what in FILES if (run.folder / name).is_file()],
         overridden={override.lstrip("+~").split("=")[0] for override in run.overrides},
         plain=html.plain,

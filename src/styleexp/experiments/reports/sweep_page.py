@@ -177,7 +177,7 @@ def settings(run: Run) -> dict[str, str]:
 
 def headline(run: Run) -> tuple[str, float] | None:
     """The most informative metric of a run, shown below its picture."""
-    for name in ("style_distance", "loss"):
+    for name in ("match", "style_distance", "loss"):
         if name in run.summary:
             return name, run.summary[name]
     return None

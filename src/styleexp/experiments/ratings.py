@@ -1,0 +1,63 @@
+"""Estimates of how raters would rate a result, from its measures.
+
+Fitted to half of the rated results and tested on the other, both printed by ``python -m
+benchmarks.agreement``. The raters were vision-language models, not people.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+MATCH = (1.0, 4.0)
+"""Match without any likeness, and its rise to a likeness of 1."""
+CRAFT = (1.0, 1.0, 1.0)
+"""Craft at a silhouette IoU of 0.9 and a bend of 1, and its falls with the logarithms."""
+LEAST_CHANGE, LEAST_BEND = 0.004, 0.01
+"""Lower bounds of 1 - IoU and of the bend, below which nobody sees a difference."""
+
+
+def match(likeness: float) -> float:
+    """Estimated match, from 1 to 5."""
+    return clipped(MATCH[0] + MATCH[1] * likeness)
+
+
+def craft(silhouette_iou: float, bend: float) -> float:
+    """Estimated craft, from 1 to 5: outlines that change and surfaces that crumple cost."""
+    change = math.log(max(1 - silhouette_iou, LEAST_CHANGE) / 0.1)
+    return clipped(CRAFT[0] - CRAFT[1] * change - CRAFT[2] * math.log(max(bend, LEAST_BEND)))
+
+
+def clipped(rating: float) -> float:
+    """Within the scale."""
+    return min(max(rating, 1.0), 5.0)
+
+
+REGIONS = {
+    "outer": "the outer parts",
+    "top": "the top",
+    "bottom": "the bottom",
+    "front": "the front",
+    "back": "the back",
+}
+LESS = 0.2
+"""How much less than the whole surface's coverage a region's must be to be named."""
+
+
+def verdict(found: Mapping[str, float]) -> str | None:
+    """One line about a result, from its metrics; None if they are of an older version.
+
+    For instance "carries the style on 64 % of the surface, on 31 % of the outer parts; match about
+    3.1 of 5, craft about 4.2".
+    """
+    if "craft" not in found:
+        return None
+    rated = f"craft about {found['craft']:.1f} of 5"
+    if "coverage" not in found:
+        return rated
+    covered = f"carries the style on {100 * found['coverage']:.0f} % of the surface"
+    least = min(REGIONS, key=lambda name: found[f"coverage_{name}"])
+    share = found[f"coverage_{least}"]
+    if share < found["coverage"] - LESS:
+        covered += f", on {100 * share:.0f} % of {REGIONS[least]}"
+    return f"{covered}; match about {found['match']:.1f} of 5, {rated}"
