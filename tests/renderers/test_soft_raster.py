@@ -13,8 +13,8 @@ from torch.autograd import gradcheck
 from styleexp.method.views import look_at
 from styleexp.renderers.base import Shading
 from styleexp.renderers.soft_raster import SoftRaster
+from styleexp.renderers.soft_raster.composing import Compose
 from styleexp.renderers.soft_raster.contour import (
-    Compose,
     CrossingDistance,
     Crossings,
     neighbours,
@@ -215,13 +215,13 @@ def test_same_input_same_bits(normals: str) -> None:
 
 def test_the_same_pixels_in_any_portions() -> None:
     """How much the rasteriser works on at once changes nothing."""
-    from styleexp.renderers.soft_raster import raster, shading
+    from styleexp.renderers.soft_raster import culling, shading
 
     vertices, faces = rendering.bumpy_sphere(2)
     arguments = (vertices, faces, rendering.cameras_around(2), Shading(normals="smooth"), (90, 70))
     whole = SoftRaster().render(*arguments)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(raster, "_CHUNK", 500)
+        patch.setattr(culling, "CHUNK", 500)
         patch.setattr(shading, "_AT_ONCE", 77)
         chunked = SoftRaster().render(*arguments)
     for name in ("face_ids", "depth", "image", "coverage"):

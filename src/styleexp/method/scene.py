@@ -145,7 +145,7 @@ def prepare(subject: Subject, parts: Parts, cache: Cache) -> PaperScene:
 
 def check_seen(what: str, statistics: Pair, subject: Subject) -> None:
     """Raise `UserError` if all statistics of the source or of the style are zero."""
-    if any(bool(each.any()) for part in statistics for each in part):
+    if bool(torch.stack([each.any() for part in statistics for each in part]).any()):
         return
     mesh = subject.source if what == "source" else subject.style.mesh
     if mesh is not None and (stray := stray_faces(what, mesh)):
@@ -180,12 +180,12 @@ def foreground_mean(
 ) -> float:
     """Mean grey of the mesh's pixels over eight views around it."""
     look = Shading(albedo=shading.albedo, normals=shading.normals)
-    azimuth = torch.arange(8, device=surface.vertices.device) * (math.pi / 4)
+    azimuth = torch.arange(8) * (math.pi / 4)
     cameras = orbit(torch.zeros_like(azimuth), azimuth, views.distance, views.fov)
     with torch.no_grad():
         out = renderer.render(surface.vertices, surface.faces, cameras, look, (64, 64))
-    seen = out.coverage > 0.99
-    return float(out.image[seen].mean()) if bool(seen.any()) else 0.5
+    image, seen = out.image.cpu(), out.coverage.cpu() > 0.99
+    return float(image[seen].mean()) if bool(seen.any()) else 0.5
 
 
 def choose_shading(config: ShadingConfig, grey: float) -> Shading:

@@ -120,7 +120,7 @@ def whole_image_bank(
             yield _all_seen(image), _all_seen(image)
             continue
         windows, view = views.crop_windows(local, count, generator)
-        cut = views.crop_images(image, windows.to(image), view.to(image.device), local.size)
+        cut = views.crop_images(image, windows, view, local.size)
         yield _all_seen(image), _all_seen(cut)
 
 
