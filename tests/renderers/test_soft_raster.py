@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 
 import pytest
@@ -253,49 +252,6 @@ def test_neighbours_of_a_strip() -> None:
     none = 3
     expected = [[none, 0, 1], [1, none, none], [none, 2, none]]
     assert neighbours(faces, 5).tolist() == expected
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-@pytest.mark.parametrize("normals", ["flat", "smooth"])
-def test_cuda_equals_cpu(normals: str) -> None:
-    vertices, faces = rendering.bumpy_sphere(4)
-    results = []
-    for device in ("cpu", "cuda"):
-        moved = vertices.to(device).requires_grad_()
-        cameras = rendering.cameras_around(3)
-        out = SoftRaster().render(
-            moved, faces.to(device), cameras, Shading(normals=normals), (100, 100)
-        )
-        (gradient,) = torch.autograd.grad((out.image**2).sum() + out.coverage.sum(), moved)
-        results.append((out.image.detach().cpu(), out.face_ids.cpu(), gradient.cpu()))
-    (image, ids, gradient), (cuda_image, cuda_ids, cuda_gradient) = results
-    assert (ids != cuda_ids).float().mean() < 1e-4
-    assert ((image - cuda_image).abs() > 1e-3).float().mean() < 1e-3
-    relative = (gradient - cuda_gradient).norm() / gradient.norm()
-    assert relative < 0.02
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_the_host_waits_for_the_device_as_often_for_many_views_and_never_backward() -> None:
-    vertices, faces = rendering.bumpy_sphere(3)
-    vertices, faces = vertices.cuda().requires_grad_(), faces.cuda()
-    renderer, shading = SoftRaster(), Shading(normals="smooth")
-    waits = []
-    try:
-        for views in (1, 1, 8):  # the first is the warm-up
-            with warnings.catch_warnings(record=True) as told:
-                warnings.simplefilter("always")
-                torch.cuda.set_sync_debug_mode("warn")
-                out = renderer.render(
-                    vertices, faces, rendering.cameras_around(views), shading, (64, 64)
-                )
-                loss = out.image.square().sum() + out.coverage.sum()
-                waits.append(sum("synchronizing" in str(each.message) for each in told))
-            torch.cuda.set_sync_debug_mode("error")
-            loss.backward()
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-    assert waits[1] == waits[2]
 
 
 def test_faces_too_small_for_float32_pass_no_gradient():

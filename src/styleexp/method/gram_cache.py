@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING
 import torch
 
 from styleexp.inputs import assets
-from styleexp.system import atomic, digests
+from styleexp.system import atomic, digests, process
+from styleexp.system.transfer import to_host
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -56,11 +57,13 @@ class GramCache:
         digest = hashlib.sha256(_code())
         known = [*self.options, torch.__version__, torch.get_num_threads()]
         known += [torch.backends.cpu.get_cpu_capability(), self.encoder.precision]
-        for item in [*known, *about, *self.encoder.state_dict().values()]:
+        known.append(process.gpu(next(self.encoder.parameters()).device))
+        items = [*known, *about, *self.encoder.state_dict().values()]
+        values = iter(to_host([item for item in items if isinstance(item, torch.Tensor)]))
+        for item in items:
             if isinstance(item, torch.Tensor):
-                flat = item.detach().cpu().contiguous().flatten()
                 digest.update(f"{item.device} {item.dtype} {tuple(item.shape)}".encode())
-                digest.update(flat.view(torch.uint8).numpy().data)
+                digest.update(next(values).flatten().view(torch.uint8).numpy().data)
             else:
                 digest.update(f"{item!r};".encode())
         return digest.hexdigest()[:32]
@@ -96,7 +99,7 @@ def _read(path: Path, encoder: Encoder) -> tuple[Statistics, Statistics] | None:
     with suppress(OSError):  # read-only cache
         os.utime(path)
     device = next(encoder.parameters()).device
-    ordered = [(name, tensors[name].to(device)) for name in sorted(tensors)]
+    ordered = [(name, tensors[name].to(device, non_blocking=True)) for name in sorted(tensors)]
     whole, local = ([t for n, t in ordered if n.startswith(k)] for k in ("global", "local"))
     return whole, local
 
@@ -106,7 +109,8 @@ def _write(path: Path, found: tuple[Statistics, Statistics]) -> None:
 
     tensors: dict[str, Tensor] = {}
     for kind, each in zip(("global", "local"), found, strict=True):
-        tensors |= {f"{kind}.{i:02d}": gram.contiguous().cpu() for i, gram in enumerate(each)}
+        tensors |= {f"{kind}.{i:02d}": gram for i, gram in enumerate(each)}
+    tensors = dict(zip(tensors, to_host(list(tensors.values())), strict=True))
     content = save(tensors, {"digest": digests.of(tensors)})
     with suppress(OSError):  # the cache is optional
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -84,11 +84,11 @@ def height_map(subject: Subject, patch: float) -> HeightMap:
     style, device = subject.style, subject.surface.vertices.device
     heights = subject.heights
     if heights is not None:
-        height = heights.height.to(device)
+        height = heights.height.to(device, non_blocking=True)
         side = pictures.picture_side(subject.settings.style, subject.unit)
     else:
         assert style.mesh is not None
-        height = torch.from_numpy(mesh_patch(style.mesh, patch)).to(device)
+        height = torch.from_numpy(mesh_patch(style.mesh, patch)).to(device, non_blocking=True)
         side = patch * math.sqrt(2) * subject.unit
     # Detail finer than the source's edges would alias to noise.
     edge = (

@@ -152,13 +152,15 @@ def layer_masks(
     summed = functional.pad(background, (1, 0, 1, 0)).to(torch.int32)
     for dim in (1, 2):
         summed = summed.cumsum(dim, dtype=torch.int32)
-    rows = _between(summed, 1, tuple(shape[0] for shape in shapes), erosion)
-    masks, begin = [], 0
-    for row_cells, column_cells in shapes:
-        some = rows[:, begin : begin + row_cells]
-        masks.append(_between(some, 2, (column_cells,), erosion) == 0)
-        begin += row_cells
-    return masks
+    rows_of_all, columns_of_all = zip(*shapes, strict=True)
+    rows = _between(summed, 1, rows_of_all, erosion)
+    if coverage.device.type != "cpu":  # every layer's rows and columns: more work, fewer kernels
+        free = (_between(rows, 2, columns_of_all, erosion) == 0).split(rows_of_all, 1)
+        return [some.split(columns_of_all, 2)[i] for i, some in enumerate(free)]
+    return [
+        _between(some, 2, (columns,), erosion) == 0
+        for some, columns in zip(rows.split(rows_of_all, 1), columns_of_all, strict=True)
+    ]
 
 
 def _between(summed: Tensor, dim: int, cells: tuple[int, ...], erosion: int) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from styleexp.method.views import orbit
 from styleexp.renderers.base import Shading
 from styleexp.system.errors import UserError
 from styleexp.system.progress import doing
+from styleexp.system.transfer import to_host
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -95,13 +97,18 @@ def prepare(subject: Subject, parts: Parts, cache: Cache) -> PaperScene:
             light_frame=settings.shading.light_frame,
         )
 
+    @functools.cache
+    def own_viewer() -> Viewer:
+        return viewer(surface, 1.0)
+
     def described(mesh: Surface, scale: float) -> targets.FixedTarget:
         """Statistics over a bank of views, cached across runs with the same inputs."""
 
         def make() -> Pair:
             doing(f"rendering views of {len(mesh.faces):,} faces for the target")
+            seen_by = own_viewer() if mesh is surface else viewer(mesh, scale)
             bank = settings.loss.bank_views
-            return targets.mesh_statistics(loss, viewer(mesh, scale), mesh.vertices, bank)
+            return targets.mesh_statistics(loss, seen_by, mesh.vertices, bank)
 
         device = str(mesh.vertices.device)
         about = [mesh.vertices, mesh.faces, scale, lights, shading, device, style.mesh is None]
@@ -134,7 +141,7 @@ def prepare(subject: Subject, parts: Parts, cache: Cache) -> PaperScene:
     return PaperScene(
         subject=subject,
         notes=notes,
-        viewer=viewer(surface, 1.0),
+        viewer=own_viewer(),
         loss=loss,
         target=target,
         base=base,
@@ -184,7 +191,8 @@ def foreground_mean(
     cameras = orbit(torch.zeros_like(azimuth), azimuth, views.distance, views.fov)
     with torch.no_grad():
         out = renderer.render(surface.vertices, surface.faces, cameras, look, (64, 64))
-    image, seen = out.image.cpu(), out.coverage.cpu() > 0.99
+    image, coverage = to_host((out.image, out.coverage))
+    seen = coverage > 0.99
     return float(image[seen].mean()) if bool(seen.any()) else 0.5
 
 

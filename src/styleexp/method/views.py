@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch.nn import functional
 
-from styleexp.method.surface import Surface, sample_surface
+from styleexp.method.surface import sample_surface
 from styleexp.renderers.base import Cameras
 
 if TYPE_CHECKING:
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from styleexp.method.options import LocalViewsConfig, ViewsConfig
+    from styleexp.method.surface import Surface
     from styleexp.renderers.base import Renderer, Shading
 
 POLE_GUARD = math.radians(85.0)
@@ -193,8 +194,7 @@ def surface_cameras(
     keeps the direction of stripes. Points occluded by another part of the mesh are dropped, so
     there are at most ``count`` cameras. They are on the CPU.
     """
-    on_cpu = Surface(*(each.cpu() for each in (surface.vertices, surface.faces, surface.normals)))
-    points, directions = sample_surface(on_cpu, 2 * count, generator)
+    points, directions = sample_surface(surface.on_cpu, 2 * count, generator)
     distance = extent / (2 * math.tan(math.radians(SURFACE_FOV) / 2))
     cameras = look_at(points + distance * directions, points, SURFACE_FOV)
     with torch.no_grad():

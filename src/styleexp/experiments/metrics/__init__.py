@@ -24,6 +24,7 @@ from styleexp.method.patches import Relief, closest, relief_of_mesh, relief_of_r
 from styleexp.method.subject import pattern_unit
 
 if TYPE_CHECKING:
+    import torch
     from jaxtyping import Float, Int
 
     from styleexp.config.schema import Config
@@ -65,11 +66,13 @@ def judge_name(name: str, trained: str | None) -> str | None:
     return None if name == "none" else name
 
 
-def load_judge(name: str | None, windows: int) -> Judge | None:
-    """Load the judge of that name; downloads its weights if needed."""
+def load_judge(name: str | None, windows: int, device: str | torch.device = "cpu") -> Judge | None:
+    """Load the judge of that name onto the device; downloads its weights if needed."""
     from styleexp.plugins import load_encoder
 
-    return None if name is None else Judge(name, load_encoder(name), windows)
+    if name is None:
+        return None
+    return Judge(name, load_encoder(name, device=device), windows)
 
 
 def measure(

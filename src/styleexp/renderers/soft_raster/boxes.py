@@ -128,6 +128,8 @@ def _boxes(
 
 def _fill(best: Tensor, boxes: _Boxes, total: int, width: int) -> None:
     """Depth test of all pixels of the boxes."""
+    if not total:
+        return
     if total <= AT_ONCE:
         _test(best, boxes, slice(None), 0, total, width)
         return

@@ -167,7 +167,7 @@ def _contour_edges(
             base + which.reshape(-1).index_select(0, place)
             for which in (corners, corners.roll(-1, 0))
         )
-        return view, place % corners.shape[1], start, end
+        return view, place % max(1, corners.shape[1]), start, end
     found = []
     for k in range(3):
         view, face = positions(take(away, across[k]).logical_and_(chosen))

@@ -139,7 +139,7 @@ class SumAtVertices(torch.autograd.Function):
 
 def _at(values: Float[Tensor, "3 n"], corners: Int[Tensor, "3 m"]) -> Float[Tensor, "3 3 m"]:
     """Values at each face's corners, (axis, corner, face), in one kernel."""
-    return values.index_select(1, corners.reshape(-1)).view(-1, *corners.shape)
+    return values.index_select(1, corners.reshape(-1)).unflatten(1, corners.shape)
 
 
 def _summed(
@@ -147,7 +147,7 @@ def _summed(
 ) -> Float[Tensor, "3 n"]:
     """Sum of values (axis, corner, face) at ``count`` vertices, in few kernels."""
     out = values.new_zeros(values.shape[0], count)
-    return out.index_add_(1, corners.reshape(-1), values.reshape(values.shape[0], -1))
+    return out.index_add_(1, corners.reshape(-1), values.flatten(1))
 
 
 def unit(vectors: Float[Tensor, "3 n"]) -> Float[Tensor, "3 n"]:

@@ -116,13 +116,14 @@ def lit_directly(
     height, width = visible.face_ids.shape[1:]
     at_corners = corners.index_select(1, visible.face)
     index = at_corners + visible.view * points.shape[2]
-    x, y, w = points.reshape(3, -1).index_select(1, index.view(-1)).view(3, 3, -1)
+    x, y, w = points.flatten(1).index_select(1, index.view(-1)).unflatten(1, index.shape)
     row = visible.pixel // width
     column = visible.pixel - row * width
     right = torch.addcmul(x, column.to(w) + 0.5, w, value=-1)
     down = torch.addcmul(y, (row % height).to(w) + 0.5, w, value=-1)
     weights = right.roll(1, 0) * down.roll(-1, 0) - right.roll(-1, 0) * down.roll(1, 0)
-    normal = (normals.index_select(1, at_corners.view(-1)).view(3, 3, -1) * weights).sum(1)
+    at = normals.index_select(1, at_corners.view(-1)).unflatten(1, at_corners.shape)
+    normal = (at * weights).sum(1)
     squared = (normal * normal).sum(0)
     normal = normal * torch.where(squared > 0, squared, 1.0).rsqrt()
     lights = light.transpose(1, 2).index_select(2, visible.view)
