@@ -9,6 +9,7 @@ another checkout of this repository.
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import tempfile
 from collections import Counter
@@ -17,9 +18,9 @@ from typing import Any
 
 PARTS = {
     "views": ("views.py", "viewer.py"),
-    "visibility": ("raster.py",),
+    "visibility": ("raster.py", "boxes.py", "culling.py"),
     "shading": ("shading.py", "geometry.py", "deferred.py", "base.py"),
-    "outlines": ("contour.py",),
+    "outlines": ("contour.py", "composing.py"),
     "encoder": ("vgg.py",),
     "Gram matrices and loss": ("losses.py",),
     "field": ("fields.py",),
@@ -106,8 +107,6 @@ def main() -> None:
     assert simulated_cuda
     columns: dict[str, tuple[Counts, Counts]] = {}
     with tempfile.TemporaryDirectory() as cache:
-        import os
-
         os.environ["STYLEEXP_CACHE"] = cache  # so that Gram matrices are measured, not read
         for name, words in SETTINGS.items():
             if options.only is None or options.only in name:

@@ -5,9 +5,11 @@ import torch
 
 from styleexp.method.pictures import resized
 from styleexp.renderers.base import Shading
+from styleexp.renderers.moderngl_deferred import ModernGLDeferred
 from styleexp.renderers.soft_raster import SoftRaster, boxes, contour
 from styleexp.testing import NotApplicable, rendering
 from styleexp.testing import renderers as testing
+from tests.helpers.needed import available
 
 pytestmark = pytest.mark.usefixtures("gpu")
 
@@ -37,14 +39,15 @@ def test_check_renderer_covers_the_device(monkeypatch):
     assert "2 of 4 checks failed" in str(failure.value)
 
 
-def seen(device, normals="smooth", outlines=True, distance=1.0, level=3):
+def seen(device, normals="smooth", outlines=True, distance=1.0, level=3, renderer=None):
     """Outputs of a render, and the gradient."""
+    renderer = renderer or SoftRaster()
     vertices, faces = rendering.bumpy_sphere(level)
     moved = vertices.to(device).requires_grad_()
     cameras = rendering.cameras_around(3, focal=2.2 * distance)
     lights = torch.tensor([[0.5, 0.2, 0.4], [0.0, -0.4, 0.6]])[:, None].expand(2, 3, 3)
     shading = Shading(normals=normals, outlines=outlines, light=lights)
-    out = SoftRaster().render(moved, faces.to(device), cameras, shading, (100, 80))
+    out = renderer.render(moved, faces.to(device), cameras, shading, (100, 80))
     weights = torch.linspace(0, 1, out.image.shape[1]).to(device)[:, None, None]
     total = (out.image.square() * weights).sum()
     total = total + out.coverage.sum() if outlines else total
@@ -62,6 +65,14 @@ def test_pictures_and_gradients_are_those_of_the_cpu(normals, outlines, level):
     assert (expected[2] != found[2]).float().mean() < 1e-4
     for one, other in zip(expected[:2], found[:2], strict=True):
         assert ((one - other).abs() > 1e-3).float().mean() < 1e-3
+    assert (expected[4] - found[4]).norm() < 0.01 * expected[4].norm()
+
+
+def test_opengl_finds_what_it_finds_for_the_cpu():
+    renderer = available(ModernGLDeferred)
+    expected, found = (seen(device, renderer=renderer) for device in ("cpu", "cuda"))
+    assert (expected[2] != found[2]).float().mean() < 1e-4
+    assert ((expected[0] - found[0]).abs() > 1e-3).float().mean() < 1e-3
     assert (expected[4] - found[4]).norm() < 0.01 * expected[4].norm()
 
 

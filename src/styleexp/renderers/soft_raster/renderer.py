@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 class SoftRaster(DeferredRenderer):
     """Visibility in pure torch; see ``DeferredRenderer`` for the rest.
 
-    On the CPU, results and gradients are bitwise reproducible.
+    On the CPU, results and gradients are bitwise reproducible. On a GPU the gradients aren't: they
+    are summed by float atomics.
     """
 
     def find_visible(self, projected: Projected) -> Visible:
