@@ -28,7 +28,7 @@ def _there():
     if missing is not None:
         raise UserError(missing)
     if simulated_cuda is None and not torch.cuda.is_available():
-        raise UserError("this torch has CUDA, but there is no device")
+        raise UserError("this torch has CUDA, but sees no device: give CUDA_VISIBLE_DEVICES=0")
 
 
 @pytest.fixture
