@@ -68,7 +68,7 @@ class Counts:
         return found
 
 
-def counted(words: list[str], steps: int = 3) -> tuple[Counts, Counts]:
+def counted(words: list[str], steps: int = 2) -> tuple[Counts, Counts]:
     """Counts of the preparation and of the step with the most kernels, the first left out, for
     overrides as of ``styleexp``. The device must be simulated."""
     from styleexp.config import build
@@ -97,7 +97,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--lines", action="store_true", help="every line that waits or launches")
     parser.add_argument("--tree", help="count the package of this checkout instead")
-    parser.add_argument("--only", help="settings whose name contains this")
+    parser.add_argument("--only", type=int, help="the setting of this number, from 0")
     parser.add_argument("overrides", nargs="*", help="added to every setting")
     options = parser.parse_args()
     if options.tree:
@@ -108,8 +108,8 @@ def main() -> None:
     columns: dict[str, tuple[Counts, Counts]] = {}
     with tempfile.TemporaryDirectory() as cache:
         os.environ["STYLEEXP_CACHE"] = cache  # so that Gram matrices are measured, not read
-        for name, words in SETTINGS.items():
-            if options.only is None or options.only in name:
+        for number, (name, words) in enumerate(SETTINGS.items()):
+            if options.only in (None, number):
                 columns[name] = counted([*COMMON, *words, *options.overrides])
                 print(".", end="", file=sys.stderr, flush=True)
     print(table(columns))

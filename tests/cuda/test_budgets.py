@@ -27,7 +27,7 @@ holds all at once."""
 
 def within(words, budget):
     """Fails if a run takes more than its budget."""
-    prepared, step = waits.counted([*SMOKE, *words.split()], steps=2)
+    prepared, step = waits.counted([*SMOKE, *words.split()])
     assert prepared.waits.total() <= budget[0], prepared.waits
     assert step.waits.total() <= budget[1], step.waits
     assert step.kernels.total() <= budget[2], step.by_part()

@@ -47,7 +47,8 @@ def gradient_norm(field: torch.nn.Module) -> Float[Tensor, ""]:
 def normalise_gradient(field: torch.nn.Module, length: Float[Tensor, ""]) -> None:
     """Divide the gradient of all parameters by ``length``, its norm; zero stays zero."""
     gradients = [p.grad for p in field.parameters() if p.grad is not None]
-    torch._foreach_div_(gradients, length.clamp(min=1e-30))
+    if gradients:
+        torch._foreach_div_(gradients, length.clamp(min=1e-30))
 
 
 @dataclass(frozen=True)

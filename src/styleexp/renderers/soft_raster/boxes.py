@@ -69,8 +69,8 @@ def rasterise(
         index = (corners[:, None] + each * count).view(3, -1)
         begun = (each * (height * width)).expand(views, faces).reshape(-1)
         low = (-1 - torch.arange(faces, device=points.device)).bitwise_and_(0xFFFFFFFF)
-        crossing = pairs.chosen if pairs.crossing is None else pairs.chosen & pairs.crossing
-        whole = pairs.chosen if pairs.crossing is None else pairs.chosen & ~pairs.crossing
+        assert pairs.crossing is not None
+        crossing, whole = pairs.chosen & pairs.crossing, pairs.chosen & ~pairs.crossing
         boxes = _boxes(screen, index, whole.view(-1), begun, low.repeat(views), resolution)
         told = torch.stack([boxes.ends[-1], crossing.sum()])
         total, cut = told.tolist()
