@@ -30,15 +30,18 @@ def prepare(config: Config) -> tuple[Method[Any], Scene]:
     """The method of a run and its prepared scene; raises `UserError` for anything that's wrong with
     the configuration or the files."""
     check(config)
-    method = method_of(config)
-    return method, method.prepare(subject_of(config, method.separates_relief))
+    device = device_of(config)
+    method = method_of(config, device)
+    return method, method.prepare(subject_of(config, method.separates_relief, device))
 
 
-def method_of(config: Config) -> Method[Any]:
-    """The method named in ``config.baseline``, or the learned one with its parts."""
+def method_of(config: Config, device: torch.device | None = None) -> Method[Any]:
+    """The method named in ``config.baseline``, or the learned one with its parts, on this device
+    instead of that of ``config``."""
     if config.baseline is not None:
         return plugins.build("baseline", config.baseline)
-    device, renderer = device_of(config), plugins.build("renderer", config.renderer)
+    device = device or device_of(config)
+    renderer = plugins.build("renderer", config.renderer)
     encoder = plugins.build("encoder", config.encoder, device=device, seed=config.optim.seed)
     return PaperLoop(
         parts=Parts(renderer, encoder, plugins.build("loss", config.loss, encoder=encoder)),
@@ -48,9 +51,12 @@ def method_of(config: Config) -> Method[Any]:
     )
 
 
-def subject_of(config: Config, separate: bool = False) -> Subject:
-    """Load source and style, and measure them; see `method.subject.measure`."""
-    device = device_of(config)
+def subject_of(
+    config: Config, separate: bool = False, device: torch.device | None = None
+) -> Subject:
+    """Load source and style, and measure them, on this device instead of that of ``config``; see
+    `method.subject.measure`."""
+    device = device or device_of(config)
     source = sources.load_source(config.source)
     style = sources.load_style(config.style)
     as_tone = config.baseline is None

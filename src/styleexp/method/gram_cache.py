@@ -13,7 +13,7 @@ import os
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -53,12 +53,17 @@ class GramCache:
             _write(path, found)
         return found
 
+    @cached_property
+    def _weights(self) -> str:
+        weights = self.encoder.state_dict()
+        return digests.of(dict(zip(weights, to_host(list(weights.values())), strict=True)))
+
     def _digest(self, about: list[object]) -> str:
         digest = hashlib.sha256(_code())
         known = [*self.options, torch.__version__, torch.get_num_threads()]
         known += [torch.backends.cpu.get_cpu_capability(), self.encoder.precision]
         known.append(process.gpu(next(self.encoder.parameters()).device))
-        items = [*known, *about, *self.encoder.state_dict().values()]
+        items = [*known, *about, self._weights]
         values = iter(to_host([item for item in items if isinstance(item, torch.Tensor)]))
         for item in items:
             if isinstance(item, torch.Tensor):

@@ -111,7 +111,8 @@ def prepare(subject: Subject, parts: Parts, cache: Cache) -> PaperScene:
             return targets.mesh_statistics(loss, seen_by, mesh.vertices, bank)
 
         device = str(mesh.vertices.device)
-        about = [mesh.vertices, mesh.faces, scale, lights, shading, device, style.mesh is None]
+        known = mesh.on_cpu
+        about = [known.vertices, known.faces, scale, lights, shading, device, style.mesh is None]
         return targets.FixedTarget(*cache(about, make))
 
     target: StyleTarget
@@ -136,8 +137,10 @@ def prepare(subject: Subject, parts: Parts, cache: Cache) -> PaperScene:
         target = targets.FixedTarget(*targets.mean_statistics(loss, bank))
 
     goal, own = target(0), described(surface, 1.0)(0)
-    check_seen("source", own, subject)
-    check_seen("style", goal, subject)
+    any_of = [torch.stack([each.any() for part in pair for each in part]) for pair in (own, goal)]
+    there = torch.stack([each.any() for each in any_of]).tolist()
+    for what, seen in zip(("source", "style"), there, strict=True):
+        check_seen(what, seen, subject)
     return PaperScene(
         subject=subject,
         notes=notes,
@@ -150,9 +153,9 @@ def prepare(subject: Subject, parts: Parts, cache: Cache) -> PaperScene:
     )
 
 
-def check_seen(what: str, statistics: Pair, subject: Subject) -> None:
+def check_seen(what: str, seen: bool, subject: Subject) -> None:
     """Raise `UserError` if all statistics of the source or of the style are zero."""
-    if bool(torch.stack([each.any() for part in statistics for each in part]).any()):
+    if seen:
         return
     mesh = subject.source if what == "source" else subject.style.mesh
     if mesh is not None and (stray := stray_faces(what, mesh)):

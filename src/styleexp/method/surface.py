@@ -104,9 +104,12 @@ def normalised(mesh: meshes.Mesh, device: torch.device) -> tuple[meshes.Normalis
     frame = meshes.normalisation(mesh.vertices)
     vertices = frame.apply(mesh.vertices)
     normals = meshes.vertex_normals(vertices, mesh.faces)
-    surface = Surface(
-        torch.from_numpy(vertices).float().to(device, non_blocking=True),
-        torch.from_numpy(mesh.faces).to(device, non_blocking=True),
-        torch.from_numpy(normals).float().to(device, non_blocking=True),
+    on_cpu = Surface(
+        torch.from_numpy(vertices).float(),
+        torch.from_numpy(mesh.faces),
+        torch.from_numpy(normals).float(),
     )
+    tensors = on_cpu.vertices, on_cpu.faces, on_cpu.normals
+    surface = Surface(*(each.to(device, non_blocking=True) for each in tensors))
+    surface.__dict__["on_cpu"] = on_cpu  # known already
     return frame, surface

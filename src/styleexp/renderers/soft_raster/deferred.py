@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from styleexp.renderers.soft_raster.raster import Visible
 
 VISIBILITY_GRADIENTS = ("contour", "none")
-MOST_PAIRS = {"cpu": 1 << 22, "cuda": 1 << 24}
+MOST_PAIRS = {"cpu": 1 << 22, "cuda": 1 << 25}
 """Views times faces (or vertices) rendered per batch without gradients, by the device: bounds
 memory, about 100 bytes each on a GPU, which then waits less often."""
 
