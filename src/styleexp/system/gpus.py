@@ -24,7 +24,7 @@ DRIVER = Path("/proc/driver/nvidia/gpus")
 
 def remember() -> None:
     """Keep `VISIBLE` for processes that are started later."""
-    os.environ.setdefault(GIVEN, os.environ.get(VISIBLE, ALL))
+    os.environ[GIVEN] = os.environ.get(VISIBLE, ALL)
 
 
 def visible() -> list[str]:
