@@ -76,7 +76,12 @@ OWN_WEIGHTS = {"clip"}
     "words",
     [
         ("method=synthesis", "source.refine=none"),
-        ("method=geometric_textures", "baseline.base=50", "baseline.levels=1"),
+        (
+            "method=geometric_textures",
+            "baseline.base=50",
+            "baseline.levels=1",
+            "baseline.iterations=2",
+        ),
         *(
             ("method=robust", "field.start=source", f"{each.kind}={each.name}")
             for each in plugins.everything()
