@@ -7,11 +7,8 @@ Submitit's local processes would all use the first.
 from __future__ import annotations
 
 import os
-import tempfile
 from contextlib import suppress
 from pathlib import Path
-
-from styleexp.system import locks
 
 VISIBLE = "CUDA_VISIBLE_DEVICES"
 GIVEN = "STYLEEXP_GIVEN_GPUS"
@@ -47,6 +44,8 @@ def take_one() -> str | None:
     """Make one GPU visible to this process, which keeps it until it ends: one that no other job's
     process on this machine has, or, if there are more jobs than GPUs, one of those in turn. None
     without a GPU."""
+    from styleexp.system import locks
+
     names = visible()
     if not names:
         return None
@@ -62,5 +61,7 @@ def take_one() -> str | None:
 
 
 def _slots() -> Path:
+    import tempfile
+
     user = os.getuid() if hasattr(os, "getuid") else "user"
     return Path(tempfile.gettempdir()) / f"styleexp-gpus-{user}"
