@@ -62,6 +62,7 @@ def test_check_renderer_reports_all_failures(monkeypatch: pytest.MonkeyPatch) ->
 
     some = (testing.orientation, testing.crop_is_part_of_whole, testing.triangle_area)
     monkeypatch.setattr(testing, "CHECKS", some)
+    monkeypatch.setattr(testing, "devices", lambda renderer: ["cpu"])
     with pytest.raises(AssertionError, match="2 of 3 checks failed") as failure:
         testing.check_renderer(Upside())
     assert "orientation" in str(failure.value)
