@@ -7,6 +7,7 @@ from styleexp.method.pictures import resized
 from styleexp.renderers.base import Shading
 from styleexp.renderers.moderngl_deferred import ModernGLDeferred
 from styleexp.renderers.soft_raster import SoftRaster, boxes, contour
+from styleexp.renderers.soft_raster.culling import FacePairs
 from styleexp.testing import NotApplicable, rendering
 from styleexp.testing import renderers as testing
 from tests.helpers.needed import available
@@ -16,10 +17,12 @@ pytestmark = pytest.mark.usefixtures("gpu")
 
 SLOW = (testing.gradient_of_scale, testing.gradient_of_smooth_field)
 """Of a fine render, which takes long; gradients are compared with the CPU's below."""
+MANY = (testing.watertight, testing.watertight_on_pixel_centres)
+"""Of hundreds of renders, each slow when simulated."""
 
 
 @pytest.mark.parametrize(
-    "check", [c for c in testing.CHECKS if c not in SLOW], ids=lambda check: check.__name__
+    "check", [c for c in testing.CHECKS if c not in SLOW + MANY], ids=lambda check: check.__name__
 )
 def test_conformance(check):
     assert rendering.devices(SoftRaster()) == ["cpu", "cuda"]
@@ -28,6 +31,21 @@ def test_conformance(check):
             check(SoftRaster())
         except NotApplicable as reason:
             pytest.skip(str(reason))
+
+
+class Boxes(SoftRaster):
+    """The GPU's rasteriser, on the CPU."""
+
+    def find_visible(self, projected):
+        pairs = projected.pairs
+        crossing = torch.zeros_like(pairs.chosen) if pairs.crossing is None else pairs.crossing
+        given = projected.points, projected.corners, FacePairs(pairs.chosen, crossing)
+        return boxes.rasterise(*given, projected.near, projected.resolution)
+
+
+@pytest.mark.parametrize("check", MANY, ids=lambda check: check.__name__)
+def test_the_gpus_rasteriser_is_watertight(check):
+    check(Boxes())
 
 
 def test_check_renderer_covers_the_device(monkeypatch):
