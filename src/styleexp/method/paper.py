@@ -95,21 +95,20 @@ class PaperLoop(Method[PaperScene]):
             state.optimizer.zero_grad()
             total.backward()
             gradient = gradient_norm(state.field)
-            found = read(
-                {
-                    "the displacement": displacement,
-                    "the global views": whole.image,
-                    "the local views": local.image,
-                    "the loss of the global views": loss_global,
-                    "the loss of the local views": loss_local,
-                    "the loss": total,
-                },
-                {
-                    "gradient": gradient,
-                    "rms": displacement.detach().square().mean().sqrt(),
-                    "blank": whole.blank() + local.blank(),
-                },
-            )
+            measured = {
+                "the displacement": displacement,
+                "the global views": whole.image,
+                "the local views": local.image,
+                "the loss of the global views": loss_global,
+                "the loss of the local views": loss_local,
+                "the loss": total,
+            }
+            numbers = {
+                "gradient": gradient,
+                "rms": displacement.detach().square().mean().sqrt(),
+                "blank": whole.blank() + local.blank(),
+            }
+            found = read(measured, numbers)
             # The field is still unchanged by the step.
             check_finite(state.step + 1, found.ranges)
             (loss_value, _) = found.ranges["the loss"]
