@@ -2,6 +2,8 @@
 # make test   set up .venv, run every test
 # make test-quick   the tests of geometry, files, losses and fields alone, which run no command: under
 #             two minutes on two cores
+# make test-cuda   the tests of CUDA alone, on a GPU or, with a torch without CUDA, a simulated one
+# make test-simulated   every test with the simulated GPU as its device (what fails: docs/benchmarks.md)
 # make lint   ruff and mypy
 # make docs   the documentation, to site/index.html; warnings are errors
 # make conformance   write docs/conformance.md from the checks of every renderer
@@ -41,7 +43,7 @@ export OMP_WAIT_POLICY ?= PASSIVE
 # Named meshes and images, if there are any next to the checkout.
 export STYLEEXP_ASSETS ?= $(wildcard $(abspath ../shared))
 
-.PHONY: demo test test-quick lint docs conformance stress stress-sweeps stress-folders stress-fuzz stress-faults \
+.PHONY: demo test test-quick test-cuda test-simulated lint docs conformance stress stress-sweeps stress-folders stress-fuzz stress-faults \
 	stress-long matrix sbom audit bench-guard ray-test clean
 .DELETE_ON_ERROR:
 
@@ -53,6 +55,12 @@ test: $(VENV)/.installed-dev
 
 test-quick: $(VENV)/.installed-dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal -m 'not slow' $(QUICK)
+
+test-cuda: $(VENV)/.installed-dev
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal tests/cuda
+
+test-simulated: $(VENV)/.installed-dev
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal -p tests.helpers.simulated_cuda
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

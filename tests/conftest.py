@@ -10,6 +10,9 @@ from tests.helpers.needed import available
 
 # Read when torch loads, here and in the processes that tests start.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+# A GPU rounds otherwise, and not twice alike: what is tested on one is in tests/cuda, where torch
+# may see it: CUDA_VISIBLE_DEVICES=0 make test-cuda.
+os.environ.setdefault("CUDA_VISIBLE_DEVICES", "")
 
 BESIDE = ROOT.parent / "shared"
 if "STYLEEXP_ASSETS" not in os.environ and BESIDE.is_dir():

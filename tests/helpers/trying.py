@@ -26,12 +26,12 @@ OVERRIDES = (
 
 
 @functools.cache
-def _encoder(precision: str) -> Any:
+def _encoder(precision: str, device: str) -> Any:
     from styleexp.config.compose import compose
     from styleexp.plugins.discovery import build  # not the patched one
 
     options = compose([*OVERRIDES, f"encoder.precision={precision}"]).encoder
-    return build("encoder", options, device="cpu", seed=0)
+    return build("encoder", options, device=device, seed=0)
 
 
 @contextlib.contextmanager
@@ -42,7 +42,9 @@ def one_encoder(precision: str = "auto") -> Iterator[None]:
     real = plugins.build
 
     def build(kind: str, options: Any, **given: Any) -> Any:
-        return _encoder(precision) if kind == "encoder" else real(kind, options, **given)
+        if kind == "encoder":
+            return _encoder(precision, str(given["device"]))
+        return real(kind, options, **given)
 
     with mock.patch("styleexp.plugins.build", build):
         yield

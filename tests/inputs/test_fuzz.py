@@ -316,7 +316,7 @@ def test_bounds_on_memory_change_no_bit():
     with (
         mock.patch.object(contour, "MOST_CROSSINGS", 50),
         mock.patch.object(contour, "chunks", lambda counts: [7] * (len(counts) // 7 + 1)),
-        mock.patch.object(deferred, "MOST_PAIRS", 2 * len(faces)),
+        mock.patch.dict(deferred.MOST_PAIRS, cpu=2 * len(faces)),
     ):
         for one, other in zip(render(), whole, strict=True):
             assert torch.equal(one, other)

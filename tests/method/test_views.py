@@ -6,8 +6,6 @@ import torch
 from styleexp.method import views
 from styleexp.method.options import LocalViewsConfig, ViewsConfig
 
-CPU = torch.device("cpu")
-
 
 def project(cameras, point):
     """NDC of a world point in every camera, by the contract in renderers/base.py."""
@@ -43,7 +41,7 @@ def test_poles_are_guarded(elevation):
 
 def test_first_view_is_the_centre_and_others_spread_as_configured():
     config = ViewsConfig(spread="normal", elevation=10, azimuth=20, azimuth_std=45)
-    cameras = views.sample_global(config, rng(), CPU, 2000)
+    cameras = views.sample_global(config, rng(), 2000)
     centre = views.orbit(
         torch.tensor([math.radians(10)]), torch.tensor([math.radians(20)]), 2.0, 60.0
     )
@@ -54,7 +52,7 @@ def test_first_view_is_the_centre_and_others_spread_as_configured():
 
 
 def test_views_around_leave_no_side_out():
-    cameras = views.sample_global(ViewsConfig(spread="around", count=8), rng(), CPU)
+    cameras = views.sample_global(ViewsConfig(spread="around", count=8), rng())
     azimuth = torch.atan2(cameras.rotation[:, 2, 0], cameras.rotation[:, 2, 2]).sort().values
     gaps = torch.cat([azimuth[1:], azimuth[:1] + 2 * math.pi]) - azimuth
     assert gaps.max() == pytest.approx(math.pi / 4, abs=1e-4)
@@ -62,7 +60,7 @@ def test_views_around_leave_no_side_out():
 
 def test_a_steps_randomness_depends_on_seed_and_step_alone():
     def draw(seed, step):
-        return views.sample_global(ViewsConfig(), views.step_generator(seed, step), CPU).rotation
+        return views.sample_global(ViewsConfig(), views.step_generator(seed, step)).rotation
 
     assert torch.equal(draw(3, 7), draw(3, 7))
     assert not torch.equal(draw(3, 7), draw(3, 8))

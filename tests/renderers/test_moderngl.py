@@ -276,14 +276,3 @@ def test_without_the_package_one_sentence_names_the_remedy(tmp_path, package):
     told = complaint(command("renderer=moderngl_deferred", cwd=tmp_path, PYTHONPATH=str(tmp_path)))
     assert package in told
     assert "pip install moderngl" in told
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_cuda_tensors(renderer):
-    vertices, faces = rendering.bumpy_sphere(4)
-    on_cpu, gradient = rendered(renderer, vertices, faces, around(), "smooth")
-    moved = vertices.cuda().requires_grad_()
-    out = renderer.render(moved, faces.cuda(), around(), Shading(normals="smooth"), (160, 200))
-    assert out.image.is_cuda
-    assert torch.allclose(out.image.cpu(), on_cpu.image, atol=1e-3)
-    assert gradient.isfinite().all()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 
 import pytest
@@ -13,8 +12,8 @@ from torch.autograd import gradcheck
 from styleexp.method.views import look_at
 from styleexp.renderers.base import Shading
 from styleexp.renderers.soft_raster import SoftRaster
+from styleexp.renderers.soft_raster.composing import Compose
 from styleexp.renderers.soft_raster.contour import (
-    Compose,
     CrossingDistance,
     Crossings,
     neighbours,
@@ -63,6 +62,7 @@ def test_check_renderer_reports_all_failures(monkeypatch: pytest.MonkeyPatch) ->
 
     some = (testing.orientation, testing.crop_is_part_of_whole, testing.triangle_area)
     monkeypatch.setattr(testing, "CHECKS", some)
+    monkeypatch.setattr(testing, "devices", lambda renderer: ["cpu"])
     with pytest.raises(AssertionError, match="2 of 3 checks failed") as failure:
         testing.check_renderer(Upside())
     assert "orientation" in str(failure.value)
@@ -215,13 +215,13 @@ def test_same_input_same_bits(normals: str) -> None:
 
 def test_the_same_pixels_in_any_portions() -> None:
     """How much the rasteriser works on at once changes nothing."""
-    from styleexp.renderers.soft_raster import raster, shading
+    from styleexp.renderers.soft_raster import culling, shading
 
     vertices, faces = rendering.bumpy_sphere(2)
     arguments = (vertices, faces, rendering.cameras_around(2), Shading(normals="smooth"), (90, 70))
     whole = SoftRaster().render(*arguments)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(raster, "_CHUNK", 500)
+        patch.setattr(culling, "CHUNK", 500)
         patch.setattr(shading, "_AT_ONCE", 77)
         chunked = SoftRaster().render(*arguments)
     for name in ("face_ids", "depth", "image", "coverage"):
@@ -253,49 +253,6 @@ def test_neighbours_of_a_strip() -> None:
     none = 3
     expected = [[none, 0, 1], [1, none, none], [none, 2, none]]
     assert neighbours(faces, 5).tolist() == expected
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-@pytest.mark.parametrize("normals", ["flat", "smooth"])
-def test_cuda_equals_cpu(normals: str) -> None:
-    vertices, faces = rendering.bumpy_sphere(4)
-    results = []
-    for device in ("cpu", "cuda"):
-        moved = vertices.to(device).requires_grad_()
-        cameras = rendering.cameras_around(3)
-        out = SoftRaster().render(
-            moved, faces.to(device), cameras, Shading(normals=normals), (100, 100)
-        )
-        (gradient,) = torch.autograd.grad((out.image**2).sum() + out.coverage.sum(), moved)
-        results.append((out.image.detach().cpu(), out.face_ids.cpu(), gradient.cpu()))
-    (image, ids, gradient), (cuda_image, cuda_ids, cuda_gradient) = results
-    assert (ids != cuda_ids).float().mean() < 1e-4
-    assert ((image - cuda_image).abs() > 1e-3).float().mean() < 1e-3
-    relative = (gradient - cuda_gradient).norm() / gradient.norm()
-    assert relative < 0.02
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_the_host_waits_for_the_device_as_often_for_many_views_and_never_backward() -> None:
-    vertices, faces = rendering.bumpy_sphere(3)
-    vertices, faces = vertices.cuda().requires_grad_(), faces.cuda()
-    renderer, shading = SoftRaster(), Shading(normals="smooth")
-    waits = []
-    try:
-        for views in (1, 1, 8):  # the first is the warm-up
-            with warnings.catch_warnings(record=True) as told:
-                warnings.simplefilter("always")
-                torch.cuda.set_sync_debug_mode("warn")
-                out = renderer.render(
-                    vertices, faces, rendering.cameras_around(views), shading, (64, 64)
-                )
-                loss = out.image.square().sum() + out.coverage.sum()
-                waits.append(sum("synchronizing" in str(each.message) for each in told))
-            torch.cuda.set_sync_debug_mode("error")
-            loss.backward()
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-    assert waits[1] == waits[2]
 
 
 def test_faces_too_small_for_float32_pass_no_gradient():

@@ -31,7 +31,10 @@ styleexp --help lists all keys and choices, and styleexp-assets list all names.
 
 def main() -> None:
     """Entry point of the ``styleexp`` command."""
+    from styleexp.system import gpus
     from styleexp.system.errors import UserError
+
+    gpus.remember()
 
     warnings.showwarning = _show_warning  # type: ignore[assignment]
     for stream in (sys.stdout, sys.stderr):
@@ -145,6 +148,8 @@ def _job(config: DictConfig) -> float | None:
     try:
         typed = compose.typed(config)
         typed.threads = typed.threads or launchers.threads_each(runtime)
+        if in_sweep:
+            launchers.place(runtime, typed.device)
         folder = Path(runtime.runtime.output_dir)
         # Keep Hydra's grammar: resolving would lose an escaped "${" in a file's name.
         given: Any = OmegaConf.to_container(runtime.overrides.task, resolve=False)

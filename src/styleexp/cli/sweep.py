@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from styleexp.system import gpus
 from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0 if all jobs are done, else 2, also after a user error."""
     given = list(sys.argv[1:] if arguments is None else arguments)
+    gpus.remember()
     commands = {"status": _status, "collect": _collect}
     try:
         if given and given[0] in commands:

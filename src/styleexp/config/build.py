@@ -5,6 +5,7 @@ The method itself takes objects, and never sees the configuration.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -29,15 +30,17 @@ def prepare(config: Config) -> tuple[Method[Any], Scene]:
     """The method of a run and its prepared scene; raises `UserError` for anything that's wrong with
     the configuration or the files."""
     check(config)
-    method = method_of(config)
-    return method, method.prepare(subject_of(config, method.separates_relief))
+    device = device_of(config)
+    method = method_of(config, device)
+    return method, method.prepare(subject_of(config, method.separates_relief, device))
 
 
-def method_of(config: Config) -> Method[Any]:
-    """The method named in ``config.baseline``, or the learned one with its parts."""
+def method_of(config: Config, device: torch.device | None = None) -> Method[Any]:
+    """The method named in ``config.baseline``, or the learned one with its parts, on this device
+    instead of that of ``config``."""
     if config.baseline is not None:
         return plugins.build("baseline", config.baseline)
-    device = choose_device(config.device)
+    device = device or device_of(config)
     renderer = plugins.build("renderer", config.renderer)
     encoder = plugins.build("encoder", config.encoder, device=device, seed=config.optim.seed)
     return PaperLoop(
@@ -48,9 +51,12 @@ def method_of(config: Config) -> Method[Any]:
     )
 
 
-def subject_of(config: Config, separate: bool = False) -> Subject:
-    """Load source and style, and measure them; see `method.subject.measure`."""
-    device = choose_device(config.device)
+def subject_of(
+    config: Config, separate: bool = False, device: torch.device | None = None
+) -> Subject:
+    """Load source and style, and measure them, on this device instead of that of ``config``; see
+    `method.subject.measure`."""
+    device = device or device_of(config)
     source = sources.load_source(config.source)
     style = sources.load_style(config.style)
     as_tone = config.baseline is None
@@ -75,14 +81,40 @@ def cache_of(config: Config, encoder: Any) -> Cache:
     return GramCache((*options, config.optim.seed), encoder)
 
 
-def choose_device(name: str) -> torch.device:
-    """The requested device; ``auto`` is CUDA if available."""
+def device_of(config: Config) -> torch.device:
+    """The device of a run: of a learned method, one that its renderer can use."""
+    if config.baseline is not None:
+        return choose_device(config.device)
+    capabilities = plugins.build("renderer", config.renderer).capabilities
+    return choose_device(config.device, config.renderer.name, capabilities.devices)
+
+
+def choose_device(
+    name: str, renderer: str | None = None, devices: Sequence[str] = ("cpu", "cuda")
+) -> torch.device:
+    """The requested device; ``auto`` is CUDA if there is one and ``renderer`` can use it.
+
+    ``devices`` are the kinds of device that the renderer can use (``capabilities.devices``). Raises
+    `UserError` for one that can't be used, whether by the renderer or at all: a kernel is tried.
+    """
     if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        there = torch.cuda.is_available() and "cuda" in devices
+        return _tried("cuda", "auto") if there else torch.device("cpu")
+    device = _tried(name, name)
+    if device.type not in devices:
+        raise UserError(
+            f"renderer={renderer} can't use device={name}, only {', '.join(devices)}: use "
+            f"device={devices[0]}, or another renderer."
+        )
+    return device
+
+
+def _tried(name: str, asked: str) -> torch.device:
+    """The device, on which a kernel has run: a card can be too old for this build of torch."""
     try:
         device = torch.device(name)
-        torch.empty(0, device=device)
+        torch.ones(1, device=device).add_(1).item()
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
-        raise UserError(f"device={name} can't be used ({reason}): use device=cpu.") from error
+        raise UserError(f"device={asked} can't be used ({reason}): use device=cpu.") from error
     return device

@@ -64,7 +64,8 @@ class Config(Settings):
     report: bool = True
     """Write the run's page, ``report.html``: about 3 MB and 1 s for 20 000 faces."""
     device: str = "auto"
-    """``auto`` (CUDA if available), ``cpu``, ``cuda`` or ``cuda:N``."""
+    """``auto`` (CUDA if available and if the renderer can use it), ``cpu``, ``cuda`` or
+    ``cuda:N``."""
     threads: int = option(0, between=(0, 4096))
     """CPU threads for torch; 0: all cores."""
     debug: bool = False

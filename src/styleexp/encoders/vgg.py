@@ -289,7 +289,7 @@ def build(
         encoder.convs.to(torch.bfloat16)
     # The fast convolutions need channels_last; only 4-D tensors change their layout.
     encoder.convs.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    return encoder.to(device)
+    return encoder.to(device, non_blocking=True)
 
 
 def fastest_precision(device: torch.device) -> str:

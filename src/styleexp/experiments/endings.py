@@ -83,14 +83,21 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def out_of_memory(config: Config, error: BaseException) -> str:
-    """One sentence for the user about a lack of memory."""
+    """One sentence for the user about a lack of memory, the machine's or a GPU's."""
+    import torch
+
+    views = "fewer or smaller views (views.count, views.resolution), "
+    remedy = f"{'' if config.baseline else views}a mesh with fewer faces, or fewer runs at once"
+    if isinstance(error, torch.OutOfMemoryError):
+        asked = re.search(r"allocate ([\d.]+ \w+)", str(error))
+        more = f" (failed to allocate {asked[1]})" if asked else ""
+        return (
+            f"there is not enough memory on the GPU for this run{more}: use {remedy} on it, or "
+            "device=cpu."
+        )
     asked = re.search(r"allocate (\d+) bytes", str(error))
     more = f" (failed to allocate {int(asked[1]) / 1e6:.0f} MB)" if asked else ""
-    views = "fewer or smaller views (views.count, views.resolution), "
-    return (
-        f"there is not enough memory for this run{more}: use "
-        f"{'' if config.baseline else views}a mesh with fewer faces, or fewer runs at once."
-    )
+    return f"there is not enough memory for this run{more}: use {remedy}."
 
 
 def fail(folder: RunFolder, reason: str) -> None:

@@ -18,7 +18,7 @@ from styleexp.experiments import endings, progress
 from styleexp.experiments.sweeps.claim import PATIENCE, busy
 from styleexp.runs import identity, origins, reading, records
 from styleexp.runs.jobs import Job
-from styleexp.system import atomic, locks, process
+from styleexp.system import atomic, gpus, locks, process
 from styleexp.system.errors import UserError
 from styleexp.system.progress import announced, doing
 
@@ -240,6 +240,10 @@ def _determined(scene: Scene, config: Config, assets: dict[str, Any]) -> dict[st
         "notes": [*subject.notes, *scene.notes],
         "judge": _judge_name(config),
     }
+    if gpu := process.gpu(subject.surface.vertices.device):
+        found["gpu"] = gpu
+    if gpus.VISIBLE in os.environ:
+        found["visible_gpus"] = os.environ[gpus.VISIBLE]
     if isinstance(scene, PaperScene):
         found["encoder_precision"] = scene.encoder.precision
     return found
@@ -334,7 +338,8 @@ def _measure(result: Result, config: Config) -> dict[str, float]:
     """Measure against the result's own source, whose faces a baseline may have subdivided."""
     from styleexp.experiments import metrics
 
-    judge = metrics.load_judge(_judge_name(config), config.metrics.windows)
+    device = result.subject.surface.vertices.device
+    judge = metrics.load_judge(_judge_name(config), config.metrics.windows, device)
     source, style = result.subject.source, result.subject.style
     return metrics.measure(config, source, style, result.vertices, source.faces, judge)
 

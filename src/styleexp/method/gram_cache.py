@@ -13,14 +13,15 @@ import os
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 
 from styleexp.inputs import assets
-from styleexp.system import atomic, digests
+from styleexp.system import atomic, digests, process
+from styleexp.system.transfer import to_host
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -52,15 +53,22 @@ class GramCache:
             _write(path, found)
         return found
 
+    @cached_property
+    def _weights(self) -> str:
+        weights = self.encoder.state_dict()
+        return digests.of(dict(zip(weights, to_host(list(weights.values())), strict=True)))
+
     def _digest(self, about: list[object]) -> str:
         digest = hashlib.sha256(_code())
         known = [*self.options, torch.__version__, torch.get_num_threads()]
         known += [torch.backends.cpu.get_cpu_capability(), self.encoder.precision]
-        for item in [*known, *about, *self.encoder.state_dict().values()]:
+        known.append(process.gpu(next(self.encoder.parameters()).device))
+        items = [*known, *about, self._weights]
+        values = iter(to_host([item for item in items if isinstance(item, torch.Tensor)]))
+        for item in items:
             if isinstance(item, torch.Tensor):
-                flat = item.detach().cpu().contiguous().flatten()
                 digest.update(f"{item.device} {item.dtype} {tuple(item.shape)}".encode())
-                digest.update(flat.view(torch.uint8).numpy().data)
+                digest.update(next(values).flatten().view(torch.uint8).numpy().data)
             else:
                 digest.update(f"{item!r};".encode())
         return digest.hexdigest()[:32]
@@ -96,7 +104,7 @@ def _read(path: Path, encoder: Encoder) -> tuple[Statistics, Statistics] | None:
     with suppress(OSError):  # read-only cache
         os.utime(path)
     device = next(encoder.parameters()).device
-    ordered = [(name, tensors[name].to(device)) for name in sorted(tensors)]
+    ordered = [(name, tensors[name].to(device, non_blocking=True)) for name in sorted(tensors)]
     whole, local = ([t for n, t in ordered if n.startswith(k)] for k in ("global", "local"))
     return whole, local
 
@@ -106,7 +114,8 @@ def _write(path: Path, found: tuple[Statistics, Statistics]) -> None:
 
     tensors: dict[str, Tensor] = {}
     for kind, each in zip(("global", "local"), found, strict=True):
-        tensors |= {f"{kind}.{i:02d}": gram.contiguous().cpu() for i, gram in enumerate(each)}
+        tensors |= {f"{kind}.{i:02d}": gram for i, gram in enumerate(each)}
+    tensors = dict(zip(tensors, to_host(list(tensors.values())), strict=True))
     content = save(tensors, {"digest": digests.of(tensors)})
     with suppress(OSError):  # the cache is optional
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -84,11 +84,11 @@ def height_map(subject: Subject, patch: float) -> HeightMap:
     style, device = subject.style, subject.surface.vertices.device
     heights = subject.heights
     if heights is not None:
-        height = heights.height.to(device)
+        height = heights.height
         side = pictures.picture_side(subject.settings.style, subject.unit)
     else:
         assert style.mesh is not None
-        height = torch.from_numpy(mesh_patch(style.mesh, patch)).to(device)
+        height = torch.from_numpy(mesh_patch(style.mesh, patch))
         side = patch * math.sqrt(2) * subject.unit
     # Detail finer than the source's edges would alias to noise.
     edge = (
@@ -98,8 +98,8 @@ def height_map(subject: Subject, patch: float) -> HeightMap:
     if heights is not None and heights.in_proportion:
         half = pictures.spread(heights.height)  # before filtering, so the amplitude is unchanged
     else:
-        half = max(half_range(fit.cpu().numpy().ravel()), 1e-6)
-    return HeightMap((fit - fit.mean()) / half, side)
+        half = max(half_range(fit.numpy().ravel()), 1e-6)
+    return HeightMap(((fit - fit.mean()) / half).to(device, non_blocking=True), side)
 
 
 def mesh_patch(style: meshes.Mesh, radius: float) -> Float[np.ndarray, "side side"]:

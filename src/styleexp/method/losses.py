@@ -4,6 +4,7 @@ comparison."""
 from __future__ import annotations
 
 import copy
+import functools
 import math
 import re
 from abc import ABC, abstractmethod
@@ -130,12 +131,12 @@ class _Gram(torch.autograd.Function):
         views, channels, height, width = features.shape
         cells = features.permute(0, 2, 3, 1).reshape(views, height * width, channels)
         if mask is not None:
-            cells = cells * mask.reshape(views, height * width, 1).to(cells.dtype)
+            cells = cells * mask.reshape(views, height * width, 1)
         ctx.save_for_backward(cells)
         ctx.cells = (height, width)
         # Sum views in float32 (or better) to keep the rounding error small with bfloat16 features.
         per_view = torch.bmm(cells.transpose(1, 2), cells)
-        return per_view.to(torch.promote_types(per_view.dtype, torch.float32)).sum(0)
+        return per_view.sum(0, dtype=torch.promote_types(per_view.dtype, torch.float32))
 
     @staticmethod
     @once_differentiable
@@ -164,17 +165,38 @@ def layer_masks(
     summed = functional.pad(background, (1, 0, 1, 0)).to(torch.int32)
     for dim in (1, 2):
         summed = summed.cumsum(dim, dtype=torch.int32)
-    masks = []
-    for shape in shapes:
-        counted = summed
-        for dim, cells in enumerate(shape, 1):
-            size, cell = coverage.shape[dim], torch.arange(cells, device=coverage.device)
-            first, last = (cell - erosion).clamp_min(0), (cell + erosion).clamp_max(cells - 1)
-            # Sizes that don't divide evenly: a cell covers all pixels it touches.
-            begin, end = first * size // cells, ((last + 1) * size + cells - 1) // cells
-            counted = counted.index_select(dim, end) - counted.index_select(dim, begin)
-        masks.append(counted == 0)
-    return masks
+    rows_of_all, columns_of_all = zip(*shapes, strict=True)
+    rows = _between(summed, 1, rows_of_all, erosion)
+    if coverage.device.type != "cpu":  # every layer's rows and columns: more work, fewer kernels
+        free = (_between(rows, 2, columns_of_all, erosion) == 0).split(rows_of_all, 1)
+        return [some.split(columns_of_all, 2)[i] for i, some in enumerate(free)]
+    return [
+        _between(some, 2, (columns,), erosion) == 0
+        for some, columns in zip(rows.split(rows_of_all, 1), columns_of_all, strict=True)
+    ]
+
+
+def _between(summed: Tensor, dim: int, cells: tuple[int, ...], erosion: int) -> Tensor:
+    """Sums over each cell and its neighbours along a dimension of a summed-area table, for layers
+    of so many cells, one after the other."""
+    begin, end = _bounds(summed.shape[dim] - 1, cells, erosion, summed.device)
+    return summed.index_select(dim, end) - summed.index_select(dim, begin)
+
+
+@functools.cache  # small, always the same, and a dozen kernels each
+def _bounds(
+    size: int, cells: tuple[int, ...], erosion: int, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """First pixel of each cell's neighbourhood, and the one after its last."""
+    bounds = []
+    for count in cells:
+        cell = torch.arange(count)
+        first, last = (cell - erosion).clamp_min(0), (cell + erosion).clamp_max(count - 1)
+        # Sizes that don't divide evenly: a cell covers all pixels it touches.
+        begin, end = first * size // count, ((last + 1) * size + count - 1) // count
+        bounds.append(torch.stack([begin, end]))
+    begin, end = torch.cat(bounds, 1).to(device, non_blocking=True)
+    return begin, end
 
 
 class LayerLoss(Loss):
@@ -240,6 +262,15 @@ class GramLoss(LayerLoss):
     ) -> Float[Tensor, ""]:
         """Weighted sum over layers of the squared Frobenius distances (Eq. 8), each divided by its
         layer's scale."""
+        if found[0].device.type != "cpu":  # all layers at once, in a tenth of the kernels
+            ours, theirs = (
+                torch.cat([gram.flatten() for gram in each]) for each in (found, target)
+            )
+            weights = torch.tensor(self.weights).to(ours.device, non_blocking=True)
+            factors = (weights / torch.stack(scales)).unbind()
+            pairs = zip(factors, found, strict=True)
+            each = torch.cat([factor.expand(gram.numel()) for factor, gram in pairs])
+            return ((ours - theirs).square() * each).sum()
         total = found[0].new_zeros(())
         for gram, goal, weight, scale in zip(found, target, self.weights, scales, strict=True):
             total = total + weight * (gram - goal).square().sum() / scale

@@ -24,10 +24,12 @@ from styleexp.method.large_steps import AdamUniform
 from styleexp.method.masks import masked
 from styleexp.method.scene import Cache, PaperScene, Parts, prepare
 from styleexp.method.stepping import (
-    check_numbers,
+    check_finite,
+    check_loss,
     gradient_norm,
     learning_rate,
     normalise_gradient,
+    read,
 )
 from styleexp.method.surface import unfolded
 from styleexp.method.targets import in_step
@@ -66,7 +68,7 @@ class PaperLoop(Method[PaperScene]):
             sigma=subject.sigma,
             bound=subject.bound * (1.0 if scene.base is None else settings.field.learned),
         )
-        field.to(subject.surface.vertices.device)
+        field.to(subject.surface.vertices.device, non_blocking=True)
         field.connect(subject.surface.faces)
         check_field(field, subject.surface.vertices, subject.bound)
         kinds = {"each": torch.optim.Adam, "uniform": AdamUniform}
@@ -96,7 +98,9 @@ class PaperLoop(Method[PaperScene]):
             penalty = (displacement / subject.relief).pow(4).mean()
             total = total + options.relief_weight * penalty
 
-            first = total.item() if first is None else first
+            state.optimizer.zero_grad()
+            total.backward()
+            gradient = gradient_norm(state.field)
             measured = {
                 "the displacement": displacement,
                 "the global views": whole.image,
@@ -105,22 +109,30 @@ class PaperLoop(Method[PaperScene]):
                 "the loss of the local views": loss_local,
                 "the loss": total,
             }
-            check_numbers(state.step + 1, measured, total.item(), first)
-            state.optimizer.zero_grad()
-            total.backward()
-            gradient = gradient_norm(state.field)
-            check_numbers(state.step + 1, {"the gradient": gradient})
+            numbers = {
+                "gradient": gradient,
+                "rms": displacement.detach().square().mean().sqrt(),
+                "blank": whole.blank() + local.blank(),
+            }
+            found = read(measured, numbers)
+            # The field is still unchanged by the step.
+            check_finite(state.step + 1, found.ranges)
+            (loss_value, _) = found.ranges["the loss"]
+            first = loss_value if first is None else first
+            check_loss(state.step + 1, loss_value, first)
+            length = found.numbers["gradient"]
+            check_finite(state.step + 1, {"the gradient": (length, length)})
             if optim.unit_gradient:
                 normalise_gradient(state.field, gradient)
             state.optimizer.step()
             state.step += 1
             yield Step(
                 state.step,
-                total.item(),
-                loss_global.item(),
-                loss_local.item(),
-                displacement.detach().square().mean().sqrt().item(),
-                whole.blank() + local.blank(),
+                loss_value,
+                found.ranges["the loss of the global views"][0],
+                found.ranges["the loss of the local views"][0],
+                found.numbers["rms"],
+                round(found.numbers["blank"]),
                 time.perf_counter() - begun,
             )
 

@@ -7,6 +7,7 @@ the image's longer side.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -30,6 +31,8 @@ LEAST_CONTRAST = 1e-3
 """Standard deviation of an image's tone in [0, 1], below which it is only rounding noise."""
 STEEPEST = 0.05
 """Minimum z of a normal; steeper ones are clamped to a slope of about 20."""
+MOST_AT_ONCE = 32
+"""Most that an image is shrunk at once on a GPU."""
 SEAM = 2.0
 """An image counts as tileable if its opposite borders differ by at most this multiple of the
 difference between neighbouring rows or columns."""
@@ -162,7 +165,26 @@ def resized(
 ) -> Float[Tensor, "rows columns"]:
     """Resize an image to about ``longer_side`` pixels on its longer side, with antialiasing."""
     factor = longer_side / max(picture.shape)
-    shape = [max(8, round(side * factor)) for side in picture.shape]
+    return shrunk(picture, [max(8, round(side * factor)) for side in picture.shape])
+
+
+def shrunk(
+    picture: Float[Tensor, "height width"], shape: Sequence[int]
+) -> Float[Tensor, "rows columns"]:
+    """Resize an image with antialiasing. CUDA's filter must fit a block's shared memory, up to
+    about 94 times smaller (float32), so there the image shrinks by steps."""
+    if picture.device.type != "cpu":
+        while any(old > MOST_AT_ONCE * new for old, new in zip(picture.shape, shape, strict=True)):
+            step = [
+                max(new, -(-old // MOST_AT_ONCE))
+                for old, new in zip(picture.shape, shape, strict=True)
+            ]
+            picture = _interpolated(picture, step)
+    return _interpolated(picture, shape)
+
+
+def _interpolated(picture: Tensor, shape: Sequence[int]) -> Tensor:
+    shape = list(shape)
     return functional.interpolate(picture[None, None], shape, mode="bilinear", antialias=True)[0, 0]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from styleexp.method.views import orbit
 from styleexp.renderers.base import Shading
 from styleexp.system.errors import UserError
 from styleexp.system.progress import doing
+from styleexp.system.transfer import to_host
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -96,16 +98,22 @@ def prepare(subject: Subject, parts: Parts, cache: Cache) -> PaperScene:
             light_frame=settings.shading.light_frame,
         )
 
+    @functools.cache
+    def own_viewer() -> Viewer:
+        return viewer(surface, 1.0)
+
     def described(mesh: Surface, scale: float) -> targets.FixedTarget:
         """Statistics over a bank of views, cached across runs with the same inputs."""
 
         def make() -> Pair:
             doing(f"rendering views of {len(mesh.faces):,} faces for the target")
+            seen_by = own_viewer() if mesh is surface else viewer(mesh, scale)
             bank = settings.loss.bank_views
-            return targets.mesh_statistics(for_bank, viewer(mesh, scale), mesh.vertices, bank)
+            return targets.mesh_statistics(for_bank, seen_by, mesh.vertices, bank)
 
         device = str(mesh.vertices.device)
-        about = [mesh.vertices, mesh.faces, scale, lights, shading, device, style.mesh is None]
+        known = mesh.on_cpu
+        about = [known.vertices, known.faces, scale, lights, shading, device, style.mesh is None]
         return targets.FixedTarget(*cache(about, make))
 
     target: StyleTarget
@@ -130,12 +138,14 @@ def prepare(subject: Subject, parts: Parts, cache: Cache) -> PaperScene:
         target = targets.FixedTarget(*targets.mean_statistics(for_bank, bank))
 
     goal, own = target(0), described(surface, 1.0)(0)
-    check_seen("source", own, subject)
-    check_seen("style", goal, subject)
+    any_of = [torch.stack([each.any() for part in pair for each in part]) for pair in (own, goal)]
+    there = torch.stack([each.any() for each in any_of]).tolist()
+    for what, seen in zip(("source", "style"), there, strict=True):
+        check_seen(what, seen, subject)
     return PaperScene(
         subject=subject,
         notes=notes,
-        viewer=viewer(surface, 1.0),
+        viewer=own_viewer(),
         loss=loss,
         target=target,
         base=base,
@@ -144,9 +154,9 @@ def prepare(subject: Subject, parts: Parts, cache: Cache) -> PaperScene:
     )
 
 
-def check_seen(what: str, statistics: Pair, subject: Subject) -> None:
+def check_seen(what: str, seen: bool, subject: Subject) -> None:
     """Raise `UserError` if all statistics of the source or of the style are zero."""
-    if any(bool(each.any()) for part in statistics for each in part):
+    if seen:
         return
     mesh = subject.source if what == "source" else subject.style.mesh
     if mesh is not None and (stray := stray_faces(what, mesh)):
@@ -181,12 +191,13 @@ def foreground_mean(
 ) -> float:
     """Mean grey of the mesh's pixels over eight views around it."""
     look = Shading(albedo=shading.albedo, normals=shading.normals)
-    azimuth = torch.arange(8, device=surface.vertices.device) * (math.pi / 4)
+    azimuth = torch.arange(8) * (math.pi / 4)
     cameras = orbit(torch.zeros_like(azimuth), azimuth, views.distance, views.fov)
     with torch.no_grad():
         out = renderer.render(surface.vertices, surface.faces, cameras, look, (64, 64))
-    seen = out.coverage > 0.99
-    return float(out.image[seen].mean()) if bool(seen.any()) else 0.5
+    image, coverage = to_host((out.image, out.coverage))
+    seen = coverage > 0.99
+    return float(image[seen].mean()) if bool(seen.any()) else 0.5
 
 
 def choose_shading(config: ShadingConfig, grey: float) -> Shading:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
@@ -45,24 +46,44 @@ def gradient_norm(field: torch.nn.Module) -> Float[Tensor, ""]:
 
 def normalise_gradient(field: torch.nn.Module, length: Float[Tensor, ""]) -> None:
     """Divide the gradient of all parameters by ``length``, its norm; zero stays zero."""
-    for parameter in field.parameters():
-        if parameter.grad is not None:
-            parameter.grad /= length.clamp(min=1e-30)
+    gradients = [p.grad for p in field.parameters() if p.grad is not None]
+    if gradients:
+        torch._foreach_div_(gradients, length.clamp(min=1e-30))
 
 
-def check_numbers(
-    step: int, parts: dict[str, Tensor], total: float = 0.0, first: float = 0.0
-) -> None:
-    """Raise `Diverged` for the first part that isn't finite, or if the loss ``total`` exceeds
-    `EXPLODED` times one plus the ``first`` one of this process. All parts are checked, because a
-    fused ReLU turns NaN into 0, so NaN in a picture may not reach the loss. The field is still
-    unchanged by the step."""
-    # Minimum and maximum are NaN if any value is: four times as fast as checking each value. All
-    # parts are checked together, since each transfer synchronises the GPU.
-    ranges = [torch.stack(values.detach().aminmax()) for values in parts.values()]
-    finite = torch.stack([each.isfinite().all() for each in ranges]).tolist()
-    for part, is_finite in zip(parts, finite, strict=True):
-        if not is_finite:
+@dataclass(frozen=True)
+class Read:
+    """A step's numbers, read from the device at once: each read would have the host wait."""
+
+    ranges: dict[str, tuple[float, float]]
+    """Least and largest value of each part; NaN if any value is."""
+    numbers: dict[str, float]
+
+
+def read(parts: dict[str, Tensor], numbers: dict[str, Tensor]) -> Read:
+    """Read the ranges of ``parts``, and ``numbers``, tensors without dimensions."""
+    # Minimum and maximum are NaN if any value is: four times as fast as checking each value.
+    ends = [
+        end
+        for values in parts.values()
+        for end in (values.aminmax() if values.dim() else (values, values))
+    ]
+    together = torch.stack([each.detach().float() for each in (*ends, *numbers.values())]).tolist()
+    pairs = zip(together[: len(ends) : 2], together[1 : len(ends) : 2], strict=True)
+    rest = together[len(ends) :]
+    return Read(dict(zip(parts, pairs, strict=True)), dict(zip(numbers, rest, strict=True)))
+
+
+def check_finite(step: int, ranges: dict[str, tuple[float, float]]) -> None:
+    """Raise `Diverged` for the first part that isn't finite. All parts are checked, because a
+    fused ReLU turns NaN into 0, so NaN in a picture may not reach the loss."""
+    for part, (least, most) in ranges.items():
+        if not (math.isfinite(least) and math.isfinite(most)):
             raise Diverged(step, f"{part} became NaN or infinite")
+
+
+def check_loss(step: int, total: float, first: float) -> None:
+    """Raise `Diverged` if the loss exceeds `EXPLODED` times one plus the ``first`` one of this
+    process."""
     if abs(total) > EXPLODED * (1 + abs(first)):
         raise Diverged(step, f"the loss exploded, from {first:.3g} to {total:.3g},")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 
 from styleexp.inputs import meshes
+from styleexp.system.transfer import to_host
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -22,6 +24,12 @@ class Surface:
     faces: Int[Tensor, "faces 3"]
     normals: Float[Tensor, "vertices 3"]
     """Unit vertex normals, area-weighted."""
+
+    @functools.cached_property
+    def on_cpu(self) -> Surface:
+        """The same on the CPU, copied once."""
+        tensors = (self.vertices, self.faces, self.normals)
+        return Surface(*to_host(tensors)) if self.vertices.device.type != "cpu" else self
 
 
 def vertex_areas(surface: Surface) -> Float[Tensor, " vertices"]:
@@ -96,9 +104,12 @@ def normalised(mesh: meshes.Mesh, device: torch.device) -> tuple[meshes.Normalis
     frame = meshes.normalisation(mesh.vertices)
     vertices = frame.apply(mesh.vertices)
     normals = meshes.vertex_normals(vertices, mesh.faces)
-    surface = Surface(
-        torch.from_numpy(vertices).float().to(device),
-        torch.from_numpy(mesh.faces).to(device),
-        torch.from_numpy(normals).float().to(device),
+    on_cpu = Surface(
+        torch.from_numpy(vertices).float(),
+        torch.from_numpy(mesh.faces),
+        torch.from_numpy(normals).float(),
     )
+    tensors = on_cpu.vertices, on_cpu.faces, on_cpu.normals
+    surface = Surface(*(each.to(device, non_blocking=True) for each in tensors))
+    surface.__dict__["on_cpu"] = on_cpu  # known already
     return frame, surface

@@ -7,7 +7,6 @@ import math
 from typing import TYPE_CHECKING, Protocol
 
 import torch
-from torch.nn import functional
 
 from styleexp.method import pictures, views
 from styleexp.method.viewer import Images
@@ -121,14 +120,13 @@ def whole_image_bank(
     ``loss.target=whole`` local views are also the whole image."""
     count, local = config.views.count, config.views.local
     size = [config.views.resolution, config.views.resolution]
-    whole = functional.interpolate(picture[None, None], size, mode="bilinear", antialias=True)
-    image = whole.permute(0, 2, 3, 1).expand(count, -1, -1, -1)
+    image = pictures.shrunk(picture, size)[None, :, :, None].expand(count, -1, -1, -1)
     for generator in _batches(config):
         if config.loss.target == "whole":
             yield _all_seen(image), _all_seen(image)
             continue
         windows, view = views.crop_windows(local, count, generator)
-        cut = views.crop_images(image, windows.to(image), view.to(image.device), local.size)
+        cut = views.crop_images(image, windows, view, local.size)
         yield _all_seen(image), _all_seen(cut)
 
 

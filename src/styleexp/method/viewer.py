@@ -10,7 +10,7 @@ import torch
 from styleexp.method import views
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Int
     from torch import Tensor
 
     from styleexp.method.options import ViewsConfig
@@ -28,9 +28,9 @@ class Images:
     image: Float[Tensor, "n height width channels"]
     coverage: Float[Tensor, "n height width"]
 
-    def blank(self) -> int:
+    def blank(self) -> Int[Tensor, ""]:
         """Number of images that don't show the mesh at all."""
-        return int((self.coverage.flatten(1).amax(1) <= 0).sum())
+        return (self.coverage.detach().flatten(1).amax(1) <= 0).sum()
 
 
 class Viewer:
@@ -75,7 +75,7 @@ class Viewer:
     def __call__(self, vertices: Float[Tensor, "vertices 3"], step: int) -> tuple[Images, Images]:
         """Global and local views of the mesh with these vertices."""
         generator = views.step_generator(self.seed, step)
-        cameras = views.sample_global(self.config, generator, vertices.device)
+        cameras = views.sample_global(self.config, generator)
         cameras = views.zoom(cameras, self.scale)
         size = self.config.resolution
         whole = self._render(vertices, cameras, size)
@@ -95,7 +95,6 @@ class Viewer:
             chosen = torch.randint(len(bank), (count * local.per_view,), generator=generator)
             return self._render(vertices, bank[chosen], local.size)
         windows, view = views.crop_windows(local, count, generator)
-        windows, view = windows.to(vertices), view.to(vertices.device)
         cut = views.crop_images(
             torch.cat([whole.image, whole.coverage[..., None]], dim=-1), windows, view, local.size
         )

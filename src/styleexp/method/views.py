@@ -79,9 +79,10 @@ def orbit(
 
 
 def sample_global(
-    config: ViewsConfig, generator: torch.Generator, device: torch.device, count: int | None = None
+    config: ViewsConfig, generator: torch.Generator, count: int | None = None
 ) -> Cameras:
-    """Random global views; with ``spread`` ``normal`` the first is exactly the centre."""
+    """Random global views, on the CPU; with ``spread`` ``normal`` the first is exactly the
+    centre."""
     count = config.count if count is None else count
     center = torch.tensor([math.radians(config.elevation), math.radians(config.azimuth)])
     std = torch.tensor([math.radians(config.elevation_std), math.radians(config.azimuth_std)])
@@ -91,7 +92,7 @@ def sample_global(
         angles[:, 1] = 2 * math.pi * (torch.arange(count) / count + start)
     else:
         angles[0] = center
-    return _to(orbit(angles[:, 0], angles[:, 1], config.distance, config.fov), device)
+    return orbit(angles[:, 0], angles[:, 1], config.distance, config.fov)
 
 
 def zoom(cameras: Cameras, factor: float) -> Cameras:
@@ -116,13 +117,16 @@ def crop_images(
     view: Int[Tensor, " crops"],
     size: int,
 ) -> Float[Tensor, "crops size size channels"]:
-    """Cut windows out of rendered views, bilinearly resized to ``size``."""
-    theta = images.new_zeros(len(windows), 2, 3)
+    """Cut windows out of rendered views, bilinearly resized to ``size``. The windows and their
+    views are on the CPU."""
+    theta = torch.zeros(len(windows), 2, 3, dtype=images.dtype)
     theta[:, 0, 0] = theta[:, 1, 1] = windows[:, 2]
     theta[:, 0, 2], theta[:, 1, 2] = windows[:, 0], -windows[:, 1]
+    theta = theta.to(images.device, non_blocking=True)
     shape = [len(windows), images.shape[3], size, size]
     grid = functional.affine_grid(theta, shape, align_corners=False)
-    cut = functional.grid_sample(images.permute(0, 3, 1, 2)[view], grid, align_corners=False)
+    chosen = images.permute(0, 3, 1, 2)[view.to(images.device, non_blocking=True)]
+    cut = functional.grid_sample(chosen, grid, align_corners=False)
     return cut.permute(0, 2, 3, 1)
 
 
@@ -141,7 +145,8 @@ def random_perspective(
     inward = torch.rand(count, 4, 2, generator=generator) * config.perspective
     drawn = torch.rand(count, 1, 1, generator=generator) < config.perspective_probability
     corners = torch.where(drawn, square * (1 - inward), square.expand(count, 4, 2))
-    to_input = homography(corners, square.expand(count, 4, 2)).to(images)
+    to_input = homography(corners, square.expand(count, 4, 2)).to(images.dtype)
+    to_input = to_input.to(images.device, non_blocking=True)
     height, width = images.shape[1:3]
     ys = (2 * torch.arange(height, device=images.device) + 1) / height - 1
     xs = (2 * torch.arange(width, device=images.device) + 1) / width - 1
@@ -149,7 +154,7 @@ def random_perspective(
         [
             xs.expand(height, width),
             ys[:, None].expand(height, width),
-            torch.ones(height, width).to(xs),
+            xs.new_ones(height, width),
         ],
         dim=-1,
     )
@@ -187,24 +192,14 @@ def surface_cameras(
     The window is ``extent`` wide at the surface, so the pattern has the same size in every image:
     heads and limbs count as much as backs, and there is no foreshortening. World +Y stays up, which
     keeps the direction of stripes. Points occluded by another part of the mesh are dropped, so
-    there are at most ``count`` cameras.
+    there are at most ``count`` cameras. They are on the CPU.
     """
-    points, directions = sample_surface(surface, 2 * count, generator)
+    points, directions = sample_surface(surface.on_cpu, 2 * count, generator)
     distance = extent / (2 * math.tan(math.radians(SURFACE_FOV) / 2))
     cameras = look_at(points + distance * directions, points, SURFACE_FOV)
     with torch.no_grad():
         depth = renderer.render(surface.vertices, surface.faces, cameras, shading, (9, 9)).depth
     if depth is None:
         return cameras[:count]
-    seen = ((depth[:, 4, 4] - distance).abs() < 0.1 * distance).nonzero().squeeze(1)
+    seen = ((depth[:, 4, 4].cpu() - distance).abs() < 0.1 * distance).nonzero().squeeze(1)
     return cameras[seen[:count]] if len(seen) else cameras[:count]
-
-
-def _to(cameras: Cameras, device: torch.device) -> Cameras:
-    return Cameras(
-        cameras.rotation.to(device),
-        cameras.translation.to(device),
-        cameras.focal.to(device),
-        cameras.center.to(device),
-        cameras.near,
-    )

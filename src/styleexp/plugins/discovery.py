@@ -26,7 +26,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cache, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from styleexp import __version__
 from styleexp.encoders.options import EncoderConfig
@@ -36,6 +36,9 @@ from styleexp.plugins import catalogue
 from styleexp.plugins.spec import Spec
 from styleexp.system.errors import UserError, unknown_name
 from styleexp.system.options import check
+
+if TYPE_CHECKING:
+    import torch
 
 VARIABLE = "STYLEEXP_PLUGINS"
 OWN = "styleexp"
@@ -181,7 +184,9 @@ def build(kind: str, options: Any, **given: Any) -> Any:
         ) from error
 
 
-def load_encoder(name: str, *, device: str = "cpu", seed: int = 0, **options: Any) -> Any:
+def load_encoder(
+    name: str, *, device: str | torch.device = "cpu", seed: int = 0, **options: Any
+) -> Any:
     """Load an encoder; the first use of a pretrained one downloads its weights.
 
     Args:

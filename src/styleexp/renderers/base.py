@@ -125,10 +125,11 @@ class Renderer(ABC):
         """Render one mesh from every camera.
 
         ``resolution`` is (height, width) in pixels. The output has the device and dtype of
-        ``vertices``. ``shading.light`` may hold several lights, on any device (`lights_of`); a
-        backend that shades with one at a time is decorated with `one_light_at_a_time`. Gradients
-        flow from ``image`` (and, with visibility gradients, ``coverage``) to ``vertices``. An empty
-        mesh renders the background.
+        ``vertices``. Cameras and lights may be on another device: a run has them on the CPU, where
+        a few numbers are combined sooner than a GPU is asked. ``shading.light`` may hold several
+        lights (`lights_of`); a backend that shades with one at a time is decorated with
+        `one_light_at_a_time`. Gradients flow from ``image`` (and, with visibility gradients,
+        ``coverage``) to ``vertices``. An empty mesh renders the background.
         """
 
 

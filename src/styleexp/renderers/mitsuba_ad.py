@@ -34,8 +34,8 @@ from styleexp.renderers.base import (
     one_light_at_a_time,
 )
 from styleexp.renderers.mitsuba_parts import integrator, load_mitsuba, outline_gradient
+from styleexp.renderers.soft_raster.culling import facing
 from styleexp.renderers.soft_raster.geometry import FaceNormals, unit, vertex_normals
-from styleexp.renderers.soft_raster.raster import facing
 from styleexp.renderers.soft_raster.shading import world_light
 from styleexp.system.errors import UserError, unknown_name
 

@@ -15,7 +15,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -63,6 +63,7 @@ def render_views(
     azimuths: list[float],
     size: int,
     frame: Float[np.ndarray, "points 3"] | None = None,
+    device: torch.device | str = "cpu",
 ) -> np.ndarray:
     """Render a mesh in the unit sphere as 8-bit grey (views, size, size), tightly framed: itself,
     or all points of ``frame``, to show several meshes at one size."""
@@ -73,14 +74,14 @@ def render_views(
     large = size * SUPERSAMPLING
     with torch.no_grad():
         out = SoftRaster().render(
-            points,
-            torch.from_numpy(np.ascontiguousarray(faces)),
+            points.to(device),
+            torch.from_numpy(np.ascontiguousarray(faces)).to(device),
             cameras,
             shading,
             (large, large),
         )
         small = torch.nn.functional.avg_pool2d(out.image.permute(0, 3, 1, 2), SUPERSAMPLING)
-    return (small[:, 0].clamp(0, 1) * 255).round().byte().numpy()
+    return (small[:, 0].clamp(0, 1) * 255).round().byte().cpu().numpy()
 
 
 def framed(
@@ -102,7 +103,8 @@ def write_preview(result: Result, size: int, path: Path) -> None:
     elevations, azimuths = [v[1] for v in VIEWS], [v[2] for v in VIEWS]
 
     def shown(vertices: np.ndarray, faces: np.ndarray) -> list[Image.Image]:
-        pictures = render_views(vertices, faces, elevations, azimuths, size)
+        device = subject.surface.vertices.device
+        pictures = render_views(vertices, faces, elevations, azimuths, size, device=device)
         return [Image.fromarray(p) for p in pictures]
 
     source = subject.frame.apply(subject.source.vertices)
@@ -124,7 +126,8 @@ def write_turntable(result: Result, frames: int, size: int, path: Path) -> None:
     """Draw one turn of the result, as an animated GIF."""
     azimuths = [360.0 * i / frames for i in range(frames)]
     generated = result.subject.frame.apply(result.vertices)
-    pictures = render_views(generated, result.faces, [15.0] * frames, azimuths, size)
+    device = result.subject.surface.vertices.device
+    pictures = render_views(generated, result.faces, [15.0] * frames, azimuths, size, device=device)
     _write_gif(pictures, path)
 
 
@@ -225,13 +228,6 @@ def silhouette_iou(
 
     Returns the IoU of every view, and this renderer's covered pixels.
     """
-    cameras = replace(
-        cameras,
-        rotation=cameras.rotation.to(device),
-        translation=cameras.translation.to(device),
-        focal=cameras.focal.to(device),
-        center=cameras.center.to(device),
-    )
     with torch.no_grad():
         out = renderer.render(
             torch.from_numpy(np.ascontiguousarray(vertices)).float().to(device),

@@ -8,11 +8,15 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import torch
 
 
 def prepare(threads: int, seed: int) -> None:
-    """Set torch's threads (0: all cores) and the global generators for a run, independent of
-    earlier state.
+    """Set torch's threads (0: all cores), its backends and the global generators for a run,
+    independent of earlier state.
 
     Built-in parts use their own generators; plugins may not. Mitsuba's variant is set in every call
     of its renderer.
@@ -25,9 +29,28 @@ def prepare(threads: int, seed: int) -> None:
     torch.set_num_threads(threads)
     if "drjit" in sys.modules:
         sys.modules["drjit"].set_thread_count(threads)
+    torch.backends.cudnn.allow_tf32 = False
+    torch.backends.cuda.matmul.allow_tf32 = False
     random.seed(seed)
     np.random.seed(seed % 2**32)
     torch.manual_seed(seed)
+
+
+def gpu(device: torch.device) -> dict[str, Any]:
+    """What a record or a cache says of a GPU: its name, and how `prepare` lets it compute. TF32,
+    torch's default for fp32 convolutions, rounds like bf16: fp32 shall mean fp32. Empty for the
+    CPU."""
+    import torch
+
+    if device.type != "cuda":
+        return {}
+    return {
+        "name": torch.cuda.get_device_name(device),
+        "tf32": {
+            "convolutions": torch.backends.cudnn.allow_tf32,
+            "products": torch.backends.cuda.matmul.allow_tf32,
+        },
+    }
 
 
 @cache
@@ -70,10 +93,17 @@ def _kept() -> list[Callable[[], None]]:
     import torch
 
     threads, drawn = torch.get_num_threads(), torch.get_rng_state()
+    convolutions, products = torch.backends.cudnn, torch.backends.cuda.matmul
+    tf32 = convolutions.allow_tf32, products.allow_tf32
+
+    def put_back_tf32() -> None:
+        convolutions.allow_tf32, products.allow_tf32 = tf32
+
     python, numpys = random.getstate(), np.random.get_state()
     restore = [
         lambda: torch.set_num_threads(threads),
         lambda: torch.set_rng_state(drawn),
+        put_back_tf32,
         lambda: random.setstate(python),
         lambda: np.random.set_state(numpys),
     ]

@@ -11,14 +11,15 @@ property, in its ``capabilities`` or by its outputs. In a test suite::
         except NotApplicable as reason:
             pytest.skip(str(reason))
 
-or, all at once, ``check_renderer(MyRenderer())``. The checks run in float32 on the backend's first
-device, and take about ten seconds on one CPU core for ``SoftRaster``.
+or, all at once, ``check_renderer(MyRenderer())``, which also runs them on CUDA if the backend
+claims it and there is one. The checks run in float32, alone on the backend's first device, and take
+about ten seconds on one CPU core for ``SoftRaster``.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -33,11 +34,13 @@ from styleexp.testing.rendering import (
     assert_supersampled,
     bumpy_sphere,
     cameras_around,
+    devices,
     face_ids,
     front_camera,
     icosphere,
     interior_pixels,
     need,
+    on,
     one_triangle,
     pixel_weights,
     rendered,
@@ -65,8 +68,22 @@ Check = Callable[[Renderer], None]
 
 
 def check_renderer(renderer: Renderer) -> dict[str, str]:
-    """Run every check; see `checks.run`."""
-    return checks.run(CHECKS, renderer)
+    """Run every check on every device that the backend claims and this machine has; see
+    `checks.run`. Outcomes on the devices after the first are named ``check (device)``."""
+    return checks.run([*CHECKS, *_elsewhere(devices(renderer)[1:])], renderer)
+
+
+def _elsewhere(names: list[str]) -> Iterator[Check]:
+    def moved(check: Check, device: str) -> Check:
+        def run(renderer: Renderer) -> None:
+            with on(device):
+                check(renderer)
+
+        run.__name__ = f"{check.__name__} ({device})"
+        return run
+
+    for device in names:
+        yield from (moved(check, device) for check in CHECKS)
 
 
 # Interpolation and light

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import TYPE_CHECKING
 
 import torch
@@ -19,6 +20,25 @@ if TYPE_CHECKING:
 
 EVEN = Shading(albedo=0.25, ambient=1.0, light=(0.0, 0.0, 0.0))
 """Shading with intensity 0.25 everywhere, so that only outlines show."""
+
+
+_DEVICE: ContextVar[str | None] = ContextVar("device", default=None)
+
+
+@contextmanager
+def on(device: str) -> Iterator[None]:
+    """Within, checks render on this device instead of the backend's first."""
+    token = _DEVICE.set(device)
+    try:
+        yield
+    finally:
+        _DEVICE.reset(token)
+
+
+def devices(renderer: Renderer) -> list[str]:
+    """The devices that the backend claims and this machine has."""
+    there = torch.cuda.is_available()
+    return [name for name in renderer.capabilities.devices if there or name != "cuda"]
 
 
 def icosphere(
@@ -104,20 +124,10 @@ def rendered(
     shading: Shading | None = None,
     size: tuple[int, int] = (32, 32),
 ) -> RenderOutput:
-    """Render on the backend's first device, and return the result on the CPU."""
-    device = renderer.capabilities.devices[0]
+    """Render on the device under test, and return the result on the CPU."""
+    device = _DEVICE.get() or renderer.capabilities.devices[0]
     out = renderer.render(
-        vertices.to(device),
-        faces.to(device),
-        replace(
-            cameras,
-            rotation=cameras.rotation.to(device),
-            translation=cameras.translation.to(device),
-            focal=cameras.focal.to(device),
-            center=cameras.center.to(device),
-        ),
-        shading or Shading(),
-        size,
+        vertices.to(device), faces.to(device), cameras, shading or Shading(), size
     )
     return RenderOutput(
         out.image.cpu(),

@@ -15,7 +15,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
+
+if TYPE_CHECKING:
+    import torch
 
 K = TypeVar("K")
 STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
@@ -58,11 +61,19 @@ def ratio(slower: list[float], faster: list[float]) -> float:
     return median(a / b for a, b in zip(slower, faster, strict=True))
 
 
-def peak_memory_mb(run: Callable[[], object]) -> float:
-    """Peak memory of the process during ``run``, in MB, including earlier allocations.
+def peak_memory_mb(run: Callable[[], object], device: torch.device | None = None) -> float:
+    """Peak memory during ``run``, in MB, including earlier allocations: a GPU's own that torch took
+    for tensors, if ``device`` is one, else that of the process.
 
-    Where the counter can't be reset (anywhere but Linux), the peak since the process started.
+    Where the process's counter can't be reset (anywhere but Linux), the peak since it started.
     """
+    if device is not None and device.type == "cuda":
+        import torch
+
+        torch.cuda.reset_peak_memory_stats(device)
+        run()
+        torch.cuda.synchronize(device)
+        return torch.cuda.max_memory_allocated(device) / 2**20
     anew = os.access(CLEAR, os.W_OK)
     if anew:
         CLEAR.write_text("5")

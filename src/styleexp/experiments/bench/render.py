@@ -45,7 +45,7 @@ def measure(task: Task, names: Sequence[str], device: torch.device, repeats: int
         name: peers.PEERS[name](task) if name in peers.PEERS else ours(task, name, device)
         for name in names
     }
-    memory = {name: peak_memory_mb(run) for name, run in contenders.items()}
+    memory = {name: peak_memory_mb(run, device) for name, run in contenders.items()}
     seen = {name: run() for name, run in contenders.items()}
     times = interleaved(contenders, repeats)
     first = names[0]

@@ -97,7 +97,7 @@ def measure(
                 watch(taken)
 
         take(2)
-        peak = peak_memory_mb(lambda: take(steps))
+        peak = peak_memory_mb(lambda: take(steps), device)
     rows = rows[2:]
     return _summary(rows, scene, calls, config) | {"peak_memory_mb": peak}
 

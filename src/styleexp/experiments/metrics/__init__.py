@@ -30,6 +30,7 @@ from styleexp.method.subject import measure as measure_subject
 from styleexp.method.synthesis.method import exemplar_of_style
 
 if TYPE_CHECKING:
+    import torch
     from jaxtyping import Float, Int
 
     from styleexp.config.schema import Config
@@ -71,11 +72,13 @@ def judge_name(name: str, trained: str | None) -> str | None:
     return None if name == "none" else name
 
 
-def load_judge(name: str | None, windows: int) -> Judge | None:
-    """Load the judge of that name; downloads its weights if needed."""
+def load_judge(name: str | None, windows: int, device: str | torch.device = "cpu") -> Judge | None:
+    """Load the judge of that name onto the device; downloads its weights if needed."""
     from styleexp.plugins import load_encoder
 
-    return None if name is None else Judge(name, load_encoder(name), windows)
+    if name is None:
+        return None
+    return Judge(name, load_encoder(name, device=device), windows)
 
 
 Banks: TypeAlias = "dict[object, Bank | None]"

@@ -18,6 +18,7 @@ from styleexp.method.losses import gram_matrix, layer_mask
 from styleexp.method.patches import SIZE, WINDOW, Relief, Windows, blurred, relief_of_mesh, windows
 from styleexp.method.views import step_generator
 from styleexp.renderers.base import Shading
+from styleexp.system.transfer import to_host
 
 if TYPE_CHECKING:
     import numpy as np
@@ -205,7 +206,10 @@ def relief_distance(result: Looks, style: Looks) -> float | None:
 def grams(
     encoder: Encoder, grey: Float[Tensor, "n size size"], mask: Bool[Tensor, "n size size"]
 ) -> Grams:
-    """One Gram per layer in ``LAYERS``, over masked cells that see only the window."""
+    """One Gram per layer in ``LAYERS``, over masked cells that see only the window; on the CPU,
+    computed where the encoder is."""
+    device = next(encoder.parameters()).device
+    grey, mask = grey.to(device), mask.to(device)
     sums: list[Tensor] = []
     counts = [0.0] * len(LAYERS)
     for at in range(0, max(len(grey), 1), 16):
@@ -222,7 +226,8 @@ def grams(
             else:
                 sums[k] = sums[k] + gram
             counts[k] += cells
-    return [total / max(count, 1.0) for total, count in zip(sums, counts, strict=True)]
+    totals = to_host(sums)
+    return [total / max(count, 1.0) for total, count in zip(totals, counts, strict=True)]
 
 
 def shaded(height: Float[Tensor, "n size size"]) -> Float[Tensor, "n size size"]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from typing import Any
 
+from styleexp.system import gpus
 from styleexp.system.errors import UserError
 
 
@@ -66,6 +67,13 @@ def threads_each(hydra: Any) -> int:
         return int(hydra.launcher.ray.remote.get("num_cpus") or 0)
     jobs = side_by_side(hydra)
     return max(1, cores() // jobs) if jobs > 1 else 0
+
+
+def place(hydra: Any, device: str) -> None:
+    """Give a job's process a GPU of its own (`gpus.take_one`), unless ``device`` names one or is
+    the CPU, or jobs run one after the other in this process."""
+    if _kind(hydra) != "basic" and device in ("auto", "cuda"):
+        gpus.take_one()
 
 
 def _kind(hydra: Any) -> str:

@@ -212,6 +212,8 @@ def _end_with_runner() -> None:
 
 def _work(config: DictConfig, root: Path, job: Job) -> None:
     """Run a job whose lock is held, with its output redirected to its log."""
+    from hydra.core.hydra_config import HydraConfig
+
     from styleexp.config import compose
     from styleexp.experiments.execute import begin
 
@@ -232,6 +234,7 @@ def _work(config: DictConfig, root: Path, job: Job) -> None:
                     "its source or style file has changed since the plan was read: start the plan "
                     "again."
                 )
+            launchers.place(HydraConfig.get(), typed.device)
             code = begin(typed, folder, [*asked, "hydra.mode=RUN"])
         except UserError as error:
             _failed(folder, str(error))

@@ -14,18 +14,20 @@ steep edges) or only pairs in columns are used.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
 
-from styleexp.renderers.soft_raster.raster import chunks, positions, ragged, take, true_indices
+from styleexp.renderers.soft_raster.culling import chunks, positions, ragged, take, true_indices
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
     from torch import Tensor
 
-    from styleexp.renderers.soft_raster.raster import FacePairs, Visible
+    from styleexp.renderers.soft_raster.culling import FacePairs
+    from styleexp.renderers.soft_raster.raster import Visible
 
 
 MOST_CROSSINGS = 1 << 20
@@ -110,28 +112,40 @@ def find_crossings(
     found: list[_Found] = []
     held = 0
     # An edge competes to be outermost in both directions, though only one is used.
-    for along_row in (True, False):
-        segments = _segments(ends, edges, visible.depth, along_row)
-        begin = 0
-        for size in chunks(segments.count):
-            part = _part(segments, slice(begin, begin + size))
-            found.append(_seen_crossings(part, visible.depth, along_row))
-            begin += size
+    both = [_segments(ends, edges, visible.depth, along_row) for along_row in (True, False)]
+    for along_row, segments, parts in zip((True, False), both, _portions(both), strict=True):
+        for part, total in parts:
+            some = segments if total is not None else _part(segments, part)
+            found.append(_seen_crossings(some, visible.depth, along_row, total))
             held += len(found[-1][1])
             if held > MOST_CROSSINGS:  # many coincident faces would otherwise fill the memory
                 found = [_outermost_of(found)]
                 held = len(found[0][1])
-    crossings, _, preferred = _outermost_of(found)
-    return _part(crossings, true_indices(preferred))
+    return _outermost_of(found, preferred_only=True)[0]
 
 
-def _outermost_of(found: list[_Found]) -> _Found:
-    """Select the outermost crossings, with their distances and preferences, in order."""
+def _portions(both: list[_Segments]) -> list[list[tuple[slice, int | None]]]:
+    """Portions of each, and the number of lines that each crosses, if known. On a GPU, all at once
+    if memory allows it: one question for both."""
+    if both[0].count.device.type != "cpu":
+        totals = torch.stack([each.count.sum() for each in both]).tolist()
+        if sum(totals) <= MOST_CROSSINGS:
+            return [[(slice(None), total)] for total in totals]
+    portions: list[list[tuple[slice, int | None]]] = []
+    for segments in both:
+        ends = [0, *itertools.accumulate(chunks(segments.count))]
+        portions.append([(slice(*pair), None) for pair in itertools.pairwise(ends)])
+    return portions
+
+
+def _outermost_of(found: list[_Found], preferred_only: bool = False) -> _Found:
+    """Select the outermost crossings, with their distances and preferences, in order; or only those
+    of them that are preferred."""
     columns = [[getattr(each, f.name) for each, _, _ in found] for f in fields(Crossings)]
     every = Crossings(*(torch.cat(column, dim=-1) for column in columns))
     distance = torch.cat([each for _, each, _ in found])
     preferred = torch.cat([each for _, _, each in found])
-    outermost = _outermost(every, distance)
+    outermost = _outermost(every, distance, preferred if preferred_only else None)
     return _part(every, outermost), distance[outermost], preferred[outermost]
 
 
@@ -145,6 +159,15 @@ def _contour_edges(
 ) -> tuple[Tensor, ...]:
     """View, face, and start and end in (views, vertices) of the contour edges."""
     away = torch.cat([~front, front.new_ones(len(front), 1)], dim=1)
+    if front.device.type != "cpu":  # all edges at once
+        each = take(away, across.reshape(-1)).unflatten(1, across.shape) & chosen[:, None]
+        view, place = positions(each.flatten(1))
+        base = view * points.shape[2]
+        start, end = (
+            base + which.reshape(-1).index_select(0, place)
+            for which in (corners, corners.roll(-1, 0))
+        )
+        return view, place % max(1, corners.shape[1]), start, end
     found = []
     for k in range(3):
         view, face = positions(take(away, across[k]).logical_and_(chosen))
@@ -164,7 +187,7 @@ def _ends(
     flat = points.reshape(3, -1)
     a, b = flat.index_select(1, start), flat.index_select(1, end)
     a_front, b_front = a[2] >= near, b[2] >= near
-    if not (a_front & b_front).all():
+    if points.device.type != "cpu" or not (a_front & b_front).all():
         rise = b[2] - a[2]
         cut = a + ((near - a[2]) / torch.where(rise == 0, 1.0, rise)) * (b - a)
         a, b = torch.where(a_front, a, cut), torch.where(b_front, b, cut)
@@ -182,7 +205,7 @@ def _segments(
     view, face, start, end = edges
     p, q, in_front = ends
     if not along_row:
-        p, q = p[[1, 0, 2]], q[[1, 0, 2]]
+        p, q = (torch.stack([each[1], each[0], each[2]]) for each in (p, q))
     across, along = (q[1] - p[1]).abs(), (q[0] - p[0]).abs()
     preferred = across >= along if along_row else across > along
     first = torch.ceil(torch.minimum(p[1], q[1]) - 0.5).clamp_min(0)
@@ -194,15 +217,15 @@ def _segments(
 
 
 def _seen_crossings(
-    segments: _Segments, depth: Tensor, along_row: bool
+    segments: _Segments, depth: Tensor, along_row: bool, total: int | None
 ) -> tuple[Crossings, Tensor, Tensor]:
     """Crossings where segments pass between two pixels, in front of the farther one, with ``s`` and
-    ``preferred``."""
+    ``preferred``. ``total`` is the number of scan lines that all cross, if known."""
     height, width = depth.shape[1:]
     # Strides between pixels and between lines, and the first pixel of the last pair.
     next_pixel, next_line = (1, width) if along_row else (width, 1)
     last = (width if along_row else height) - 2
-    owner, step = ragged(segments.count)
+    owner, step = ragged(segments.count, total)
     p_along, p_across, p_inverse_w = (row.index_select(0, owner) for row in segments.p)
     q_along, q_across, q_inverse_w = (row.index_select(0, owner) for row in segments.q)
     line = segments.first.index_select(0, owner) + step
@@ -249,15 +272,19 @@ def _seen_crossings(
     return crossings, distance.index_select(0, kept), segments.preferred.index_select(0, owner)
 
 
-def _outermost(crossings: Crossings, distance: Tensor) -> Int[Tensor, " pixel_pairs"]:
-    """Index of the outermost edge between each pair of pixels."""
+def _outermost(
+    crossings: Crossings, distance: Tensor, only: Bool[Tensor, " n"] | None
+) -> Int[Tensor, " pixel_pairs"]:
+    """Index of the outermost edge between each pair of pixels, if it is one of ``only`` these."""
     # A row pair and a column pair may share their first pixel; the parity distinguishes them.
     pair = torch.minimum(crossings.inner, crossings.outer) * 2 + crossings.along_row
     fine = 1 << 20  # steps of distance, and the outermost edge of each pair comes last
     order = (pair * (2 * fine) + (distance.clamp(0, 1) * fine).long()).argsort(stable=True)
     pair = pair[order]
     last = torch.cat([pair[1:] != pair[:-1], pair.new_ones(min(len(pair), 1), dtype=torch.bool)])
-    return order[last]
+    if only is not None:
+        last &= only[order]
+    return order[true_indices(last)]
 
 
 class CrossingDistance(torch.autograd.Function):
@@ -305,94 +332,3 @@ class CrossingDistance(torch.autograd.Function):
             for axis, value in enumerate((x, y, w)):
                 flat[axis].index_add_(0, index, value)
         return out, None
-
-
-class Compose(torch.autograd.Function):
-    """Composite intensities over a background and blend pixels across outlines.
-
-    Takes the visible pixels' intensities (channels, winners) and indices, the background, and for n
-    crossings the distances ``s`` (n), the intensities just inside the outline (channels, n), and
-    the inner and outer pixels (n), or None for all four. Returns images (channels, pixels) and
-    coverage (pixels).
-
-    A pixel is blended with its neighbour by ``|s - 0.5|``. If the weights of its neighbours sum to
-    more than one, they are scaled to one, so that the result stays within the range of its inputs.
-
-    The area that an outline sweeps changes from the outer pixel's value to that at the outline. So
-    the derivative by the distance uses the value at the outline, not that half a pixel inside: on
-    round objects shading changes fast near the outline, and the inner pixel's value would be up to
-    15 % off.
-    """
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        intensities: Tensor,
-        visible: Visible,
-        background: float,
-        distance: Tensor | None,
-        outline: Tensor | None,
-        inner: Tensor | None,
-        outer: Tensor | None,
-    ) -> tuple[Tensor, Tensor]:
-        """Blend each pixel towards its neighbours."""
-        image = intensities.new_full((len(intensities), visible.depth.numel()), background)
-        for row, values in zip(image, intensities, strict=True):
-            row.scatter_(0, visible.pixel, values)
-        coverage = image.new_zeros(image.shape[1]).scatter_(0, visible.pixel, 1.0)
-        ctx.pixel = visible.pixel
-        ctx.set_materialize_grads(False)
-        if distance is None or outline is None or inner is None or outer is None:
-            ctx.mark_non_differentiable(coverage)
-            ctx.save_for_backward()
-            return image, coverage
-        shrinks = distance < 0.5
-        target, source = torch.where(shrinks, inner, outer), torch.where(shrinks, outer, inner)
-        part = (distance - 0.5).abs_()
-        total = part.new_zeros(len(coverage)).scatter_add_(0, target, part).index_select(0, target)
-        scale = 1 / total.clamp_min(1)
-        weight = part.mul_(scale)
-        # Where weights are scaled, increasing one decreases the others.
-        shared = torch.where(total > 1, 2 * shrinks.to(scale.dtype) - 1, 0.0)
-        jumps = []
-        for row, at_outline in zip(
-            [*image, coverage], [*outline, torch.ones_like(weight)], strict=True
-        ):
-            before = row.index_select(0, target)
-            jump = at_outline - row.index_select(0, outer)
-            change = row.index_select(0, source).sub_(before).mul_(weight)
-            if len(target):
-                low, high = torch.aminmax(row)
-                row.scatter_add_(0, target, change)
-                # Clamp, because rounding could leave the range of the inputs.
-                row.scatter_(0, target, row.index_select(0, target).clamp_(low, high))
-            moved = row.index_select(0, target).sub_(before)
-            jumps.append(jump.addcmul_(moved, shared).mul_(scale))
-        ctx.save_for_backward(target, source, weight, *jumps)
-        return image, coverage
-
-    @staticmethod
-    def backward(
-        ctx: Any, to_image: Tensor | None, to_coverage: Tensor | None
-    ) -> tuple[Tensor | None, ...]:
-        """Propagate to both pixels' values, and to distances by the jump in value."""
-        nothing = (None,) * 4
-        if not ctx.saved_tensors:
-            given = None if to_image is None else to_image.index_select(1, ctx.pixel)
-            return given, None, None, *nothing
-        target, source, weight, *jumps = ctx.saved_tensors
-        rows = [None] * (len(jumps) - 1) if to_image is None else list(to_image)
-        to_distance = torch.zeros_like(weight)
-        to_intensities = None
-        if to_image is not None:
-            to_intensities = to_image.new_empty(len(to_image), len(ctx.pixel))
-        for i, (row, jump) in enumerate(zip([*rows, to_coverage], jumps, strict=True)):
-            if row is None:
-                continue
-            at_target = row.index_select(0, target)
-            to_distance.addcmul_(at_target, jump)
-            if to_intensities is not None and i < len(rows):
-                moved = at_target.mul_(weight)
-                row = row.clone().scatter_add_(0, source, moved).scatter_add_(0, target, -moved)
-                torch.index_select(row, 0, ctx.pixel, out=to_intensities[i])
-        return to_intensities, None, None, to_distance, None, None, None

@@ -27,18 +27,19 @@ def pixel_projection(
     w)``.
 
     ``w`` is the depth of ``RenderOutput.depth``; dividing by it gives pixel coordinates, where
-    pixel (r, c) has its centre at ``(c + 0.5, r + 0.5)``. Dtype and device are those of ``like``.
+    pixel (r, c) has its centre at ``(c + 0.5, r + 0.5)``. Dtype and device are those of ``like``;
+    computed where the cameras are.
     """
     height, width = resolution
-    rotation, translation = (
-        cameras.rotation.detach().to(like),
-        cameras.translation.detach().to(like),
+    rotation, translation, focal, center = (
+        each.detach().to(like.dtype)
+        for each in (cameras.rotation, cameras.translation, cameras.focal, cameras.center)
     )
-    focal, center = cameras.focal.detach().to(like), cameras.center.detach().to(like)
     right, up, backward = torch.cat([rotation, translation[:, :, None]], dim=2).unbind(1)
     x = focal[:, :1] * right - (center[:, :1] + 1) * backward
     y = -focal[:, 1:] * up + (center[:, 1:] - 1) * backward
-    return torch.stack([0.5 * width * x, 0.5 * height * y, -backward])
+    found = torch.stack([0.5 * width * x, 0.5 * height * y, -backward])
+    return found.to(like.device, non_blocking=True)
 
 
 class Project(torch.autograd.Function):
@@ -76,6 +77,13 @@ class FaceNormals(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, vertices: Tensor, corners: Tensor) -> Tensor:
         """Cross product of two edges of every face."""
+        ctx.count = vertices.shape[0]
+        if vertices.device.type != "cpu":  # in few kernels
+            first, second, third = _at(vertices.t().contiguous(), corners).unbind(1)
+            to_second, to_third = second - first, third - first
+            ctx.save_for_backward(corners, to_second, to_third)
+            along, across = (torch.cat([each, each[:2]]) for each in (to_second, to_third))
+            return along[1:4] * across[2:] - along[2:] * across[1:4]
         points = [
             [axis.index_select(0, corner) for axis in vertices.t().contiguous()]
             for corner in corners
@@ -83,13 +91,17 @@ class FaceNormals(torch.autograd.Function):
         a = [second - first for first, second in zip(points[0], points[1], strict=True)]
         b = [third - first for first, third in zip(points[0], points[2], strict=True)]
         ctx.save_for_backward(corners, *a, *b)
-        ctx.count = vertices.shape[0]
         return torch.stack(_cross(a, b))
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
         """Gradient of the cross product, summed into the corners."""
         corners, *edges = ctx.saved_tensors
+        if grad.device.type != "cpu":
+            to_second = torch.linalg.cross(edges[1], grad, dim=0)
+            to_third = torch.linalg.cross(grad, edges[0], dim=0)
+            to_corners = torch.stack([-to_second - to_third, to_second, to_third], 1)
+            return _summed(to_corners, corners, ctx.count).t(), None
         grads = grad.unbind(0)
         to_second, to_third = _cross(edges[3:], grads), _cross(grads, edges[:3])
         out = grad.new_zeros(3, ctx.count)
@@ -106,6 +118,8 @@ class SumAtVertices(torch.autograd.Function):
     def forward(ctx: Any, values: Tensor, corners: Tensor, count: int) -> Tensor:
         """Add each face's value to its three corners."""
         ctx.save_for_backward(corners)
+        if values.device.type != "cpu":
+            return _summed(values[:, None].expand(3, 3, -1), corners, count)
         out = values.new_zeros(3, count)
         for row, value in zip(out, values, strict=True):
             for corner in corners:
@@ -116,9 +130,24 @@ class SumAtVertices(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
         """Each face collects the gradients of its corners."""
         (corners,) = ctx.saved_tensors
+        if grad.device.type != "cpu":
+            return _at(grad, corners).sum(1), None, None
         rows = grad.contiguous()
         out = [sum(row.index_select(0, corner) for corner in corners) for row in rows]
         return torch.stack(out), None, None
+
+
+def _at(values: Float[Tensor, "3 n"], corners: Int[Tensor, "3 m"]) -> Float[Tensor, "3 3 m"]:
+    """Values at each face's corners, (axis, corner, face), in one kernel."""
+    return values.index_select(1, corners.reshape(-1)).unflatten(1, corners.shape)
+
+
+def _summed(
+    values: Float[Tensor, "3 3 m"], corners: Int[Tensor, "3 m"], count: int
+) -> Float[Tensor, "3 n"]:
+    """Sum of values (axis, corner, face) at ``count`` vertices, in few kernels."""
+    out = values.new_zeros(values.shape[0], count)
+    return out.index_add_(1, corners.reshape(-1), values.flatten(1))
 
 
 def unit(vectors: Float[Tensor, "3 n"]) -> Float[Tensor, "3 n"]:

@@ -17,29 +17,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from styleexp.renderers.soft_raster import culling
+from styleexp.renderers.soft_raster.culling import rows_of, true_indices
+
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import Float, Int
     from torch import Tensor
 
-_CHUNK = 1 << 18
-"""Approximate number of triangle rows, or of their pixels, per batch: bounds memory."""
+    from styleexp.renderers.soft_raster.culling import FacePairs
+
 _AT_ONCE = 1 << 16
 """Triangles per batch when finding spans, so that intermediates fit the cache."""
 _FAR = 1e30
 """Offset that excludes an edge's crossing from a maximum or minimum."""
-
-
-@dataclass(frozen=True)
-class FacePairs:
-    """Candidate pairs (view, face): facing the camera and not entirely outside the frame. Sorted by
-    view, then by face."""
-
-    view: Int[Tensor, " pairs"]
-    face: Int[Tensor, " pairs"]
-    needs_clipping: Bool[Tensor, " pairs"]
-    """Whether a corner is in front of the near plane, or behind the camera."""
-    chosen: Bool[Tensor, "views faces"]
-    """The pairs as a mask."""
 
 
 @dataclass(frozen=True)
@@ -65,81 +55,6 @@ class Visible:
     face: Int[Tensor, " winners"]
 
 
-def facing(
-    vertices: Float[Tensor, "vertices 3"],
-    corners: Int[Tensor, "3 faces"],
-    face_normals: Float[Tensor, "3 faces"],
-    eyes: Float[Tensor, "views 3"],
-) -> Bool[Tensor, "views faces"]:
-    """Whether the camera is on the outer side of each face's plane.
-
-    Evaluated in world space, so that it is also valid for faces that extend behind the camera.
-    """
-    x, y, z = vertices.t().contiguous().index_select(1, corners[0])
-    offset = face_normals[0] * x + face_normals[1] * y + face_normals[2] * z
-    side = torch.addcmul(-offset, eyes[:, :1], face_normals[0])
-    side.addcmul_(eyes[:, 1:2], face_normals[1]).addcmul_(eyes[:, 2:], face_normals[2])
-    return side > 0
-
-
-def candidate_pairs(
-    points: Float[Tensor, "3 views vertices"],
-    corners: Int[Tensor, "3 faces"],
-    front: Bool[Tensor, "views faces"],
-    near: float,
-    resolution: tuple[int, int],
-) -> FacePairs:
-    """Cull back faces, and faces outside the near plane or one side of the frame."""
-    height, width = resolution
-    x, y, w = points
-    # The frame's sides are planes in homogeneous pixels, so the tests are also valid for w < 0.
-    outside = (x < 0).byte()
-    outside |= (x > width * w).byte() << 1
-    outside |= (y < 0).byte() << 2
-    outside |= (y > height * w).byte() << 3
-    outside |= (w < near).byte() << 4
-
-    chosen = front
-    if outside.any():
-        a, b, c = (take(outside, corner) for corner in corners)
-        chosen = ((a & b & c) == 0).logical_and_(front)
-    view, face = positions(chosen)
-    crosses = torch.zeros_like(face, dtype=torch.bool)
-    if (outside >= 16).any():
-        crosses = (((a | b | c) & 16) != 0).view(-1)[view * front.shape[1] + face]
-    return FacePairs(view, face, crosses, chosen)
-
-
-def take(rows: Tensor, columns: Int[Tensor, " n"]) -> Tensor:
-    """``rows[:, columns]``; for bytes, going row by row is three times as fast."""
-    taken = rows.new_empty(len(rows), len(columns))
-    for row, into in zip(rows, taken, strict=True):
-        torch.index_select(row, 0, columns, out=into)
-    return taken
-
-
-def positions(mask: Bool[Tensor, "rows columns"]) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
-    """Row and column of each true element, in order."""
-    place = true_indices(mask.reshape(-1))
-    row = _rows_of(place, *mask.shape)
-    return row, torch.sub(place, row, alpha=mask.shape[1])
-
-
-def _rows_of(place: Int[Tensor, " n"], rows: int, columns: int) -> Int[Tensor, " n"]:
-    """Rows of sorted indices into a flattened array. Faster than division."""
-    ends = torch.searchsorted(place, torch.arange(1, rows + 1, device=place.device) * columns)
-    counts = ends.diff(prepend=ends.new_zeros(1))
-    return torch.repeat_interleave(counts, output_size=len(place))
-
-
-def true_indices(mask: Bool[Tensor, " n"]) -> Int[Tensor, " true"]:
-    """Indices of true elements. Uses NumPy on the CPU, whose branchless search is 7 times as
-    fast."""
-    if mask.device.type != "cpu":
-        return mask.nonzero().view(-1)
-    return torch.from_numpy(np.flatnonzero(mask.numpy()))
-
-
 def rasterise(
     points: Float[Tensor, "3 views vertices"],
     corners: Int[Tensor, "3 faces"],
@@ -160,7 +75,7 @@ def rasterise(
         for count, part in groups:
             found.append(_spans(setup, part, count, width))
             held += len(found[-1].start)
-            if held > _CHUNK:
+            if held > culling.CHUNK:
                 _fill(best, found)
                 found, held = [], 0
         _fill(best, found)
@@ -188,16 +103,16 @@ def _triangles(points: Tensor, corners: Tensor, pairs: FacePairs, near: float) -
     rest = (~pairs.needs_clipping).nonzero().view(-1)
     view, face = pairs.view[crossing], pairs.face[crossing]
     homogeneous = torch.stack([flat.index_select(1, i[crossing]) for i in index])
-    clipped = _clip(homogeneous, near)
+    cut_off = clipped(homogeneous, near)
     both = [
         [torch.cat([row[rest], cut]) for row, cut in zip(rows, parts, strict=True)]
-        for rows, parts in zip((whole.x, whole.y, whole.inverse_w), clipped, strict=True)
+        for rows, parts in zip((whole.x, whole.y, whole.inverse_w), cut_off, strict=True)
     ]
     view = torch.cat([pairs.view[rest], view, view])
     return Triangles(both[0], both[1], both[2], view, torch.cat([pairs.face[rest], face, face]))
 
 
-def _clip(corners: Float[Tensor, "3 3 n"], near: float) -> Float[Tensor, "3 3 2n"]:
+def clipped(corners: Float[Tensor, "3 3 n"], near: float) -> Float[Tensor, "3 3 2n"]:
     """Clip triangles, given as (corner, coordinate, triangle), at ``w = near`` and project them.
 
     Returns (coordinate, corner, triangle) of x, y and 1/w; two triangles each, the second with zero
@@ -256,7 +171,7 @@ def _by_count(counts: Int[Tensor, " n"]) -> tuple[Int[Tensor, " m"], list[tuple[
     """Sort the m non-empty items by their number of elements, ``counts``; also return the slices of
     this order with equal counts.
 
-    Each slice is processed as one dense array of not many more than _CHUNK elements.
+    Each slice is processed as one dense array of not many more than culling.CHUNK elements.
     """
     if counts.device.type == "cpu":  # numpy uses radix sort for short integers
         most = int(counts.max()) if len(counts) else 0
@@ -270,7 +185,7 @@ def _by_count(counts: Int[Tensor, " n"]) -> tuple[Int[Tensor, " m"], list[tuple[
     parts, begin = [], 0
     for count, size in enumerate(per_count[1:], 1):
         end = begin + size
-        most = max(1, _CHUNK // count)
+        most = max(1, culling.CHUNK // count)
         parts += [(count, slice(i, min(i + most, end))) for i in range(begin, end, most)]
         begin = end
     return order, parts
@@ -418,31 +333,12 @@ def _fill(best: Tensor, found: list[_Spans]) -> None:
         best.scatter_reduce_(0, pixel.view(-1), key.view(-1), "amax")
 
 
-def chunks(counts: Int[Tensor, " n"]) -> list[int]:
-    """Split items that hold ``counts`` elements each into runs with not many more than _CHUNK."""
-    chunk = torch.div(counts.cumsum(0), _CHUNK, rounding_mode="floor")
-    return torch.unique_consecutive(chunk, return_counts=True)[1].tolist() or [0]
-
-
-def ragged(counts: Int[Tensor, " n"]) -> tuple[Int[Tensor, " total"], Int[Tensor, " total"]]:
-    """For items with ``counts`` elements each: the item of every element, and its index within
-    it."""
-    ends = counts.cumsum(0)
-    total = int(ends[-1]) if len(ends) else 0
-    # Counting finished items is twice as fast as ``repeat_interleave``.
-    owner = ends.new_zeros(total + 1).scatter_add_(0, ends, torch.ones_like(ends))
-    owner = owner[:total].cumsum_(0)
-    place = torch.arange(total, device=counts.device)
-    place -= (ends - counts).index_select(0, owner)
-    return owner, place
-
-
 def _winners(best: Tensor, shape: tuple[int, int, int], dtype: torch.dtype) -> Visible:
     """Unpack the keys; the background's key, 0, is face -1 at infinity."""
     # Copy even a single number, which counts as contiguous; torch is little-endian.
     high = best.view(torch.int32).view(-1, 2)[:, 1].clone(memory_format=torch.contiguous_format)
     pixel = true_indices(high != 0)
-    view = _rows_of(pixel, shape[0], shape[1] * shape[2])
+    view = rows_of(pixel, shape[0], shape[1] * shape[2])
     depth = high.view(torch.float32).reciprocal_().to(dtype)
     face_ids = best.bitwise_not_().bitwise_left_shift_(32).bitwise_right_shift_(32)
     face = face_ids.index_select(0, pixel)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from styleexp.renderers.soft_raster import boxes, raster
 from styleexp.renderers.soft_raster.deferred import DeferredRenderer, Projected
-from styleexp.renderers.soft_raster.raster import rasterise
 
 if TYPE_CHECKING:
     from styleexp.renderers.soft_raster.raster import Visible
@@ -14,12 +14,14 @@ if TYPE_CHECKING:
 class SoftRaster(DeferredRenderer):
     """Visibility in pure torch; see ``DeferredRenderer`` for the rest.
 
-    On the CPU, results and gradients are bitwise reproducible.
+    On the CPU, results and gradients are bitwise reproducible. On a GPU the gradients aren't: they
+    are summed by float atomics.
     """
 
     def find_visible(self, projected: Projected) -> Visible:
         """Rasterise watertightly; ties go to the lowest face index."""
-        return rasterise(
+        on_cpu = projected.points.device.type == "cpu"
+        return (raster if on_cpu else boxes).rasterise(
             projected.points,
             projected.corners,
             projected.pairs,

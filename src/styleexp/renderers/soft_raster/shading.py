@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from styleexp.renderers.soft_raster.culling import positions
 from styleexp.renderers.soft_raster.geometry import unit, vertex_normals
-from styleexp.renderers.soft_raster.raster import positions
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -29,7 +29,9 @@ def world_light(
     cameras: Cameras, lights: Float[Tensor, "*lights views 3"], like: Tensor
 ) -> Float[Tensor, "*lights views 3"]:
     """Each view's light or lights in world space, direction times strength."""
-    return (lights.detach().to(like)[..., None] * cameras.rotation.detach().to(like)).sum(-2)
+    rotation = cameras.rotation.detach().to(like.dtype)
+    found = (lights.detach().to(rotation)[..., None] * rotation).sum(-2)
+    return found.to(like.device, non_blocking=True)
 
 
 class FlatSurface:
@@ -72,6 +74,10 @@ class SmoothSurface:
 
     def at_pixels(self, visible: Visible) -> Float[Tensor, "lights winners"]:
         """Intensities of the covered pixels."""
+        if self.points.device.type != "cpu":
+            return lit_directly(
+                self.points, self.normals, self.corners, visible, self.light, self.shading
+            )
         seen = faces_seen(self.points, self.corners, visible)
         matrices = NormalMatrices.apply(self.points, self.normals, seen)
         return LightPixels.apply(
@@ -94,6 +100,34 @@ class SmoothSurface:
         share = torch.where(span == 0, 0.5, sides[0] / span).clamp(0, 1)
         normal = unit(torch.lerp(ends[0], ends[1], share))
         return _lit(normal, crossings.view, self.light, self.shading)
+
+
+def lit_directly(
+    points: Float[Tensor, "3 views vertices"],
+    normals: Float[Tensor, "3 vertices"],
+    corners: Int[Tensor, "3 faces"],
+    visible: Visible,
+    light: Float[Tensor, "lights views 3"],
+    shading: Shading,
+) -> Float[Tensor, "lights winners"]:
+    """Intensities of the covered pixels on a GPU: each pixel's normal from its own face's corners,
+    weighted as in `NormalMatrices`, which share a face's work among its pixels. That would have the
+    host wait for the number of faces, and launch ten times as many kernels."""
+    height, width = visible.face_ids.shape[1:]
+    at_corners = corners.index_select(1, visible.face)
+    index = at_corners + visible.view * points.shape[2]
+    x, y, w = points.flatten(1).index_select(1, index.view(-1)).unflatten(1, index.shape)
+    row = visible.pixel // width
+    column = visible.pixel - row * width
+    right = torch.addcmul(x, column.to(w) + 0.5, w, value=-1)
+    down = torch.addcmul(y, (row % height).to(w) + 0.5, w, value=-1)
+    weights = right.roll(1, 0) * down.roll(-1, 0) - right.roll(-1, 0) * down.roll(1, 0)
+    at = normals.index_select(1, at_corners.view(-1)).unflatten(1, at_corners.shape)
+    normal = (at * weights).sum(1)
+    squared = (normal * normal).sum(0)
+    normal = normal * torch.where(squared > 0, squared, 1.0).rsqrt()
+    lights = light.transpose(1, 2).index_select(2, visible.view)
+    return (((lights * normal).sum(1) + shading.ambient) * shading.albedo).clamp(0, 1)
 
 
 def _lit(normal: Tensor, view: Tensor, light: Tensor, shading: Shading) -> Tensor:
