@@ -12,12 +12,14 @@ from __future__ import annotations
 import argparse
 import csv
 import itertools
+import math
 import sys
 from pathlib import Path
 
 import numpy as np
 
-from styleexp.experiments import ratings as ratings_of
+from styleexp.experiments import ratings
+from styleexp.experiments.ratings import LEAST_BEND, LEAST_CHANGE, MOST_DISTANCE
 from styleexp.experiments.reports import study_results
 from styleexp.experiments.reports.study_results import spearman
 
@@ -62,6 +64,10 @@ def main() -> int:
     with open(DATA / MEASURES, newline="", encoding="utf-8") as file:
         measured = {row["run"]: row for row in csv.DictReader(file)}
     rows = [(rated[run], measured[run]) for run in rated if run in measured]
+    for row in measured.values():
+        found = numbers(row)
+        row["craft"] = ratings.craft(found["silhouette_iou"], found["bend"])
+        row["match"] = ratings.match(found) if "relief_distance" in found else ""
     missing = len(rated) - len(rows)
     print(f"{len(rows)} rated results" + (f", {missing} not measured" if missing else ""))
     fit(rows)
@@ -90,35 +96,55 @@ def agreement(rows: Rows, name: str, sign: int, column: str) -> tuple[float, flo
     least `APART` apart that it orders as raters did, and their number."""
     rows = [row for row in rows if row[1].get(name)]
     values = sign * np.array([float(row[1][name]) for row in rows])
-    ratings = np.array([float(row[0][column]) for row in rows])
-    right = [
-        (values[i] - values[j]) * (ratings[i] - ratings[j]) > 0
-        for i, j in itertools.combinations(range(len(rows)), 2)
-        if abs(ratings[i] - ratings[j]) >= APART
-    ]
-    return spearman(values, ratings), float(np.mean(right)), len(right)
+    rated = np.array([float(row[0][column]) for row in rows])
+    return spearman(values, rated), *ordered(values, rated)
 
 
 def fit(rows: Rows) -> None:
-    """Print the constants of `metrics.ratings`: least squares on the development half."""
-    first = [row for row in halves(rows)[0] if row[1].get("likeness")]
-    likeness, iou, bend, match, craft = (
-        np.array([float(row[half][name]) for row in first])
-        for half, name in (
-            (1, "likeness"),
-            (1, "silhouette_iou"),
-            (1, "bend"),
-            (0, "mean"),
-            (0, "craft_mean"),
-        )
-    )
-    ones = np.ones(len(first))
-    found = np.linalg.lstsq(np.stack([ones, likeness], 1), match, rcond=None)[0]
-    print("MATCH =", tuple(round(float(x), 2) for x in found))
-    change = np.log(np.maximum(1 - iou, ratings_of.LEAST_CHANGE) / 0.1)
-    bent = np.log(np.maximum(bend, ratings_of.LEAST_BEND))
-    found = np.linalg.lstsq(np.stack([ones, -change, -bent], 1), craft, rcond=None)[0]
-    print("CRAFT =", tuple(round(float(x), 2) for x in found))
+    """Print the constants of `experiments.ratings`, least squares on the development half, and how
+    estimates agree whose constants come from all pairs but the result's own."""
+    pairs = np.array([row[0]["pair"] for row in rows])
+    first = np.isin(pairs, DEVELOPMENT)
+    for question, column in (("match", "mean"), ("craft", "craft_mean")):
+        inputs = np.array([INPUTS[question](numbers(row[1])) for row in rows])
+        inputs = np.column_stack([np.ones(len(rows)), inputs])
+        rated = np.array([row[0][column] for row in rows])
+        constants = np.linalg.lstsq(inputs[first], rated[first], rcond=None)[0]
+        print(f"{question.upper()} =", tuple(round(float(x), 2) for x in constants))
+        estimates = np.zeros(len(rows))
+        for pair in set(pairs):
+            rest = pairs != pair
+            fitted = np.linalg.lstsq(inputs[rest], rated[rest], rcond=None)[0]
+            estimates[~rest] = inputs[~rest] @ fitted
+        right, _ = ordered(estimates, rated)
+        agree = f"{spearman(estimates, rated):.2f}, {100 * right:.1f} %"
+        print(f"  each pair by the constants of all others: {agree}")
+
+
+INPUTS = {
+    "match": lambda f: (ratings.pattern(f), -min(f["style_distance"], MOST_DISTANCE)),
+    "craft": lambda f: (
+        -math.log(max(1 - f["silhouette_iou"], LEAST_CHANGE) / 0.1),
+        -math.log(max(f["bend"], LEAST_BEND)),
+    ),
+}
+"""What `experiments.ratings` weighs."""
+
+
+def numbers(row: dict[str, str]) -> dict[str, float]:
+    """The measures in a row."""
+    return {name: float(x) for name, x in row.items() if name != "run" and x}
+
+
+def ordered(values: np.ndarray, rated: np.ndarray) -> tuple[float, int]:
+    """The share of pairs of results at least `APART` apart that are ordered as raters did, and the
+    number of such pairs."""
+    right = [
+        (values[i] - values[j]) * (rated[i] - rated[j]) > 0
+        for i, j in itertools.combinations(range(len(values)), 2)
+        if abs(rated[i] - rated[j]) >= APART
+    ]
+    return float(np.mean(right)), len(right)
 
 
 def measure(folder: Path) -> None:

@@ -48,6 +48,7 @@ def test_the_style_itself_is_alike_and_nothing_else_is(bank, ball):
     for wrong in (random, -height, other - other.mean()):
         assert carried(bank, ball, wrong) < 0.35 * own
     assert carried(bank, ball, np.zeros(len(base))) == 0
+    assert bank.order > 0.8
 
 
 def test_the_height_counts_little_and_a_bend_nothing(bank, ball):
@@ -116,14 +117,32 @@ def test_verdict_names_what_is_bare():
         "carries the style on 64 % of the surface, on 31 % of the outer parts; match about 3.1 "
         "of 5, craft about 4.2 of 5"
     )
+    no_judge = found()
+    del no_judge["match"]
+    assert ratings.verdict(no_judge) == (
+        "carries the style on 64 % of the surface, craft about 4.2 of 5"
+    )
     assert ratings.verdict({"craft": 4.0}) == "craft about 4.0 of 5"
     assert ratings.verdict({"style_distance": 0.2}) is None
 
 
+def measures(**changed):
+    good = {"likeness": 0.5, "order": 1.0, "relief_distance": 1.0, "style_distance": 0.3}
+    return good | changed
+
+
 def test_estimates_fall_where_they_should_and_stay_on_the_scale():
-    rising = [ratings.match(x) for x in (0.0, 0.3, 0.6, 1.0)]
-    assert rising == sorted(rising)
-    assert len(set(rising)) == 4
+    good = ratings.match(measures())
+    for worse in ({"likeness": 0.1}, {"style_distance": 0.6}):
+        assert ratings.match(measures(**worse)) < good
     assert ratings.craft(0.99, 0.1) > ratings.craft(0.9, 0.1) > ratings.craft(0.9, 0.8)
-    for extreme in (ratings.craft(1.0, 0.0), ratings.craft(0.0, 2.0), ratings.match(-5)):
+    bare = measures(likeness=0.0, style_distance=2.0)
+    for extreme in (ratings.craft(1.0, 0.0), ratings.craft(0.0, 2.0), ratings.match(bare)):
         assert 1 <= extreme <= 5
+
+
+def test_a_style_without_order_is_known_by_its_statistics():
+    ordered = [measures(relief_distance=x) for x in (0.1, 2.0)]
+    assert ratings.pattern(ordered[0]) == ratings.pattern(ordered[1])
+    gravel = [measures(order=0.0, relief_distance=x) for x in (0.1, 2.0)]
+    assert ratings.pattern(gravel[0]) > 2 * ratings.pattern(gravel[1])

@@ -9,17 +9,32 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-MATCH = (1.0, 4.0)
-"""Match without any likeness, and its rise to a likeness of 1."""
-CRAFT = (1.0, 1.0, 1.0)
+MATCH = (2.94, 2.0, 2.85)
+"""Constant, rise with `pattern`, and fall with the style distance."""
+CRAFT = (2.67, 0.62, 0.74)
 """Craft at a silhouette IoU of 0.9 and a bend of 1, and its falls with the logarithms."""
+MOST_DISTANCE = 1.2
+"""Style distance above which nothing gets worse."""
 LEAST_CHANGE, LEAST_BEND = 0.004, 0.01
 """Lower bounds of 1 - IoU and of the bend, below which nobody sees a difference."""
 
 
-def match(likeness: float) -> float:
-    """Estimated match, from 1 to 5."""
-    return clipped(MATCH[0] + MATCH[1] * likeness)
+def match(found: Mapping[str, float]) -> float:
+    """Estimated match, from 1 to 5, of a result's ``likeness``, ``order``, ``relief_distance`` and
+    ``style_distance``."""
+    constant, by_pattern, by_distance = MATCH
+    return clipped(
+        constant
+        + by_pattern * pattern(found)
+        - by_distance * min(found["style_distance"], MOST_DISTANCE)
+    )
+
+
+def pattern(found: Mapping[str, float]) -> float:
+    """How right the pattern is, 0 to 1. A style that repeats itself is known by its patches, one
+    that doesn't, as gravel, by its statistics (`metrics.style.relief_distance`)."""
+    by_patches, by_statistics = math.sqrt(found["likeness"]), math.exp(-found["relief_distance"])
+    return found["order"] * by_patches + (1 - found["order"]) * by_statistics
 
 
 def craft(silhouette_iou: float, bend: float) -> float:
@@ -60,4 +75,6 @@ def verdict(found: Mapping[str, float]) -> str | None:
     share = found[f"coverage_{least}"]
     if share < found["coverage"] - LESS:
         covered += f", on {100 * share:.0f} % of {REGIONS[least]}"
-    return f"{covered}; match about {found['match']:.1f} of 5, {rated}"
+    if "match" in found:
+        covered += f"; match about {found['match']:.1f} of 5"
+    return f"{covered}, {rated}"

@@ -97,12 +97,13 @@ def measure(
     """All metrics of a result in its source's frame; without a judge, only those that don't need
     one. ``banks`` keeps the styles' patches for the next call.
 
-    ``match`` and ``craft`` estimate ratings from 1 to 5 (`ratings`). ``likeness`` is how much of
-    the style the surface carries, 0 to 1, and ``coverage`` the share of it that carries at least
-    half (`likeness`), of all and of five regions. ``style_distance`` is 0 for the style itself and
-    1 for no style at all (``metrics.style``). ``relief_distance`` compares without a neural
-    network. ``relief_rms`` is in radii of the normalised source, and ``relief_share`` is its ratio
-    to the style mesh's. For the content metrics, see ``metrics.shape``.
+    ``match`` and ``craft`` estimate ratings from 1 to 5 (`ratings`). ``likeness``, 0 to 1, is how
+    much of the style the surface carries, and ``order`` how far the style repeats itself;
+    ``coverage`` is the share of the surface that carries at least half of the style, of all and of
+    five regions (`metrics.likeness`). ``style_distance`` is 0 for the style itself and 1 for no
+    style at all (`metrics.style`). ``relief_distance`` compares without a neural network.
+    ``relief_rms`` is in radii of the normalised source, and ``relief_share`` is its ratio to the
+    style mesh's. For the content metrics, see `metrics.shape`.
     """
     unit = pattern_unit(config.style, source, style)
     found: dict[str, float] = {}
@@ -111,10 +112,9 @@ def measure(
     if bank is not None:
         base = raised(source, vertices, faces)
         local = likeness(bank, base, unit)
-        found["likeness"] = float(local.carried.mean())
+        found |= {"likeness": float(local.carried.mean()), "order": bank.order}
         found["coverage"] = local.coverage
         found |= {f"coverage_{where}": share for where, share in local.by_region().items()}
-        found["match"] = ratings.match(found["likeness"])
     shape = content(source, vertices, faces) | {"bend": bend(vertices, faces)}
     found["craft"] = ratings.craft(shape["silhouette_iou"], shape["bend"])
     found["relief_rms"] = _rms(relief.height)
@@ -129,6 +129,8 @@ def measure(
         apart = relief_distance(looks, goal)
         if apart is not None:
             found["relief_distance"] = apart
+            if bank is not None:
+                found["match"] = ratings.match(found)
     return found | shape | {"spike": spike(_moved(source, vertices, faces))}
 
 

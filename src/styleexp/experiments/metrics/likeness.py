@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from scipy.spatial.distance import cdist
 
 from styleexp.method.relief import smoother
 from styleexp.method.synthesis.direction import frames, turned
@@ -23,7 +24,7 @@ from styleexp.method.synthesis.exemplar import measure
 from styleexp.method.synthesis.walk import Sheet
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
     from torch import Tensor
 
     from styleexp.method.patches import Relief
@@ -39,6 +40,8 @@ LEAST_APART = 0.03
 """Lower bound of the difference between the style's own likeness and that of noise."""
 CARRIED = 0.5
 """How much of the style a point must carry to count as covered."""
+REPEATS = 0.3
+"""Difference of the style's own likeness from that of noise above which it counts as ordered."""
 BEND = 3.0
 """Wavelengths above which undulations count as shape."""
 
@@ -52,7 +55,7 @@ class Bank:
     wavelength: float
     """In units of the pattern."""
     own: float
-    """Cosine between a patch of the style and its nearest other one; median."""
+    """Cosine between a patch of the style and the nearest that doesn't overlap it; median."""
     chance: float
     """The same for noise with the style's spectrum."""
     height: float
@@ -62,6 +65,12 @@ class Bank:
     def spacing(self) -> float:
         """Distance of samples, in units of the pattern."""
         return self.wavelength / PER_WAVE
+
+    @property
+    def order(self) -> float:
+        """How far the style's patches repeat: 0 as little as noise, as gravel does; 1 as bubbles
+        do. Without order, likeness means little."""
+        return min(max((self.own - self.chance) / REPEATS, 0.0), 1.0)
 
 
 @dataclass(frozen=True)
@@ -76,9 +85,9 @@ class Likeness:
 
     @property
     def carried(self) -> Float[np.ndarray, " points"]:
-        """How much of the style each point carries, 0 to 1: likeness, times the root of the height
-        where that is below the style's, since half the height still shows most of a pattern."""
-        return self.alike * np.sqrt(self.height.clip(0, 1))
+        """How much of the style each point carries, 0 to 1: likeness, times the fourth root of the
+        height where that is below the style's, since raters mind a low pattern little."""
+        return self.alike * self.height.clip(0, 1) ** 0.25
 
     @property
     def coverage(self) -> float:
@@ -102,13 +111,16 @@ def bank_of(exemplar: Exemplar) -> Bank:
     rng = np.random.default_rng(0)
     wavelength = measure(exemplar, rng).wavelength
     spacing = wavelength / PER_WAVE
-    patches, _ = exemplar.sample(BANK, SIDE, spacing, rng, any_way=True)
-    others, _ = exemplar.sample(HELD_OUT, SIDE, spacing, np.random.default_rng(5), any_way=True)
+    patches, places = exemplar.sample(BANK, SIDE, spacing, rng, any_way=True)
+    others, held_out = exemplar.sample(
+        HELD_OUT, SIDE, spacing, np.random.default_rng(5), any_way=True
+    )
     bank = unit_slopes(patches)
+    apart = cdist(exemplar.centres(held_out), exemplar.centres(places)) > SIDE * spacing
     return Bank(
         bank,
         wavelength,
-        float(nearest(unit_slopes(others), bank).median()),
+        float(nearest(unit_slopes(others), bank, torch.from_numpy(apart)).median()),
         float(nearest(unit_slopes(like_noise(others)), bank).median()),
         float(others.std(dim=(1, 2)).median()),
     )
@@ -155,11 +167,13 @@ def unit_slopes(patches: Float[Tensor, "n side side"]) -> Float[Tensor, "n featu
 
 
 def nearest(
-    slopes: Float[Tensor, "n features"], bank: Float[Tensor, "patches features"]
+    slopes: Float[Tensor, "n features"],
+    bank: Float[Tensor, "patches features"],
+    among: Bool[Tensor, "n patches"] | None = None,
 ) -> Float[Tensor, " n"]:
-    """Cosine between each patch and its nearest in the bank."""
-    parts = [(part @ bank.T).amax(dim=1) for part in slopes.split(256)]
-    return torch.cat(parts) if parts else torch.zeros(0)
+    """Cosine between each patch and its nearest in the bank, or of those in ``among``."""
+    cosines = slopes @ bank.T
+    return (cosines if among is None else cosines.where(among, -1.0)).amax(dim=1)
 
 
 def like_noise(patches: Float[Tensor, "n side side"]) -> Float[Tensor, "n side side"]:

@@ -28,6 +28,7 @@ MEANINGS = {
     "match": "estimate of how raters rate the match with the style, from 1 to 5",
     "craft": "estimate of how raters rate how clean it is, from 1 to 5",
     "likeness": "how much of the style the surface carries, 0 to 1",
+    "order": "how far the style repeats itself, 0 to 1",
     "coverage": "share of the surface that carries at least half of the style",
     "coverage_outer": "the same of the third of the surface that is farthest out",
     "coverage_top": "of the third at the top",

@@ -64,6 +64,10 @@ class Exemplar(Protocol):
         """The patches at these positions."""
         ...
 
+    def centres(self, places: Places) -> Float[np.ndarray, "places axes"]:
+        """The centres of the patches at these positions, in the exemplar's space."""
+        ...
+
 
 @dataclass(frozen=True)
 class MeshExemplar:
@@ -123,6 +127,10 @@ class MeshExemplar:
     ) -> Float[Tensor, "patches side side"]:
         """See `Exemplar`."""
         return self._patches(places, side, spacing)[0]
+
+    def centres(self, places: Places) -> Float[np.ndarray, "places 3"]:
+        """See `Exemplar`."""
+        return self.sheet.vertices[places[:, 0].astype(np.int64)]
 
     def _patches(
         self, places: Places, side: int, spacing: float
@@ -187,6 +195,10 @@ class PictureExemplar:
             height[None], grid.view(1, -1, side, 2), padding_mode="reflection", align_corners=False
         )
         return sampled.view(-1, side, side)
+
+    def centres(self, places: Places) -> Float[np.ndarray, "places 2"]:
+        """See `Exemplar`."""
+        return places[:, :2] * self.pixel
 
 
 @dataclass(frozen=True)
