@@ -55,7 +55,7 @@ def test_the_height_counts_little_and_a_bend_nothing(bank, ball):
     base, _, height = ball
     own = carried(bank, ball, height)
     assert carried(bank, ball, height + 0.3 + 0.1 * base[:, 0]) == pytest.approx(own, abs=0.02)
-    assert carried(bank, ball, 0.5 * height) == pytest.approx(own * 0.5**0.5, abs=0.1)
+    assert carried(bank, ball, 0.5 * height) == pytest.approx(own * 0.5**0.25, abs=0.1)
     assert carried(bank, ball, 2 * height) == pytest.approx(own, abs=0.02)
 
 
@@ -97,7 +97,7 @@ def test_slopes_ignore_level_and_height():
 
 
 def test_carried_needs_likeness_and_height():
-    local = Likeness(np.zeros((3, 3)), np.array([1.0, 1.0, 0.0]), np.array([1.0, 0.25, 9.0]))
+    local = Likeness(np.zeros((3, 3)), np.array([1.0, 1.0, 0.0]), np.array([1.0, 1 / 16, 9.0]))
     assert local.carried.tolist() == [1.0, 0.5, 0.0]
 
 
