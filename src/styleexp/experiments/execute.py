@@ -341,7 +341,9 @@ def _measure(result: Result, config: Config) -> dict[str, float]:
     device = result.subject.surface.vertices.device
     judge = metrics.load_judge(_judge_name(config), config.metrics.windows, device)
     source, style = result.subject.source, result.subject.style
-    return metrics.measure(config, source, style, result.vertices, source.faces, judge)
+    return metrics.measure(
+        config, source, style, result.vertices, source.faces, judge, subject=result.subject
+    )
 
 
 def _judge_name(config: Config) -> str | None:

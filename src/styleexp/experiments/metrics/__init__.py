@@ -93,9 +93,11 @@ def measure(
     faces: Int[np.ndarray, "faces 3"],
     judge: Judge | None,
     banks: Banks | None = None,
+    subject: Subject | None = None,
 ) -> dict[str, float]:
     """All metrics of a result in its source's frame; without a judge, only those that don't need
-    one. ``banks`` keeps the styles' patches for the next call.
+    one. ``banks`` keeps the styles' patches for the next call; ``subject`` is the run's, if it is
+    at hand, whose style needn't be measured again.
 
     ``match`` and ``craft`` estimate ratings from 1 to 5 (`ratings`). ``likeness``, 0 to 1, is how
     much of the style the surface carries, and ``order`` how far the style repeats itself;
@@ -108,7 +110,7 @@ def measure(
     unit = pattern_unit(config.style, source, style)
     found: dict[str, float] = {}
     relief = relief_of_result(source, vertices, faces, unit)
-    bank = bank_for(config, source, style, {} if banks is None else banks)
+    bank = bank_for(config, source, style, {} if banks is None else banks, subject)
     if bank is not None:
         base = raised(source, vertices, faces)
         local = likeness(bank, base, unit)
@@ -134,12 +136,21 @@ def measure(
     return found | shape | {"spike": spike(_moved(source, vertices, faces))}
 
 
-def bank_for(config: Config, source: meshes.Mesh, style: Style, banks: Banks) -> Bank | None:
-    """The style's patches, from ``banks`` if they are there; None for a style without relief."""
+def bank_for(
+    config: Config,
+    source: meshes.Mesh,
+    style: Style,
+    banks: Banks,
+    subject: Subject | None = None,
+) -> Bank | None:
+    """The style's patches, from ``banks`` if they are there; None for a style without relief. A
+    ``subject`` is used if its style mesh's relief was separated, or its style is a picture."""
     unit = pattern_unit(config.style, source, style)
     key = (repr(config.style), config.baseline is None, None if style.mesh else unit)
     if key not in banks:
-        subject = style_subject(config, source, style)
+        known = subject is not None and (style.mesh is None or subject.example is not None)
+        if subject is None or not known:
+            subject = style_subject(config, source, style)
         banks[key] = None if subject.smooth else bank_of(exemplar_of_style(subject))
     return banks[key]
 
