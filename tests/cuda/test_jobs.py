@@ -140,7 +140,7 @@ def test_the_device_draws_and_judges_as_the_cpu_does():
     found, _ = result("method=displacement_map", "style=bubble", "device=cpu")
     config = compose([*SMALL, "style=bubble"])
     views = found.vertices, found.faces, [10.0], [20.0], 64
-    one, other = (previews.render_views(*views, device) for device in ("cpu", "cuda"))
+    one, other = (previews.render_views(*views, device=device) for device in ("cpu", "cuda"))
     assert (one == other).mean() > 0.999
     source, style = found.subject.source, found.subject.style
     measured = []
