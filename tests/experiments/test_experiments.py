@@ -147,7 +147,7 @@ def test_experiment_runs(path, tmp_path):
     elif "synthesis" in params.get("method", ""):
         arguments.append("source.refine=none")
     elif path.stem == "methods":  # without synthesis, which takes longer than three steps
-        arguments[0] = "+contender=displacement_map,paper"
+        arguments[:2] = ["+contender=displacement_map,paper", "+pair=critter_bubble,torus_stripe"]
         arguments.append("source.refine=none")
     for overrides in experiment_jobs([f"+experiment={path.stem}", *arguments]):
         chosen = compose([*overrides, "hydra.mode=RUN"])
