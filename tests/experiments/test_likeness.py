@@ -106,7 +106,7 @@ def test_carried_needs_likeness_and_height():
 
 def found(**more):
     regions = {f"coverage_{name}": 0.6 for name in ratings.REGIONS}
-    return {"match": 3.14, "craft": 4.2, "coverage": 0.64} | regions | more
+    return {"match": 3.14, "craft": 4.2, "coverage": 0.64, "order": 1.0} | regions | more
 
 
 def test_verdict_names_what_is_bare():
@@ -117,6 +117,8 @@ def test_verdict_names_what_is_bare():
         "carries the style on 64 % of the surface, on 31 % of the outer parts; match about 3.1 "
         "of 5, craft about 4.2 of 5"
     )
+    # Where a style is like noise, nothing can be said of where it is.
+    assert ratings.verdict(found(order=0.1)) == "match about 3.1 of 5, craft about 4.2 of 5"
     no_judge = found()
     del no_judge["match"]
     assert ratings.verdict(no_judge) == (

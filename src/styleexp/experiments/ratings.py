@@ -55,6 +55,8 @@ REGIONS = {
     "front": "the front",
     "back": "the back",
 }
+LEAST_ORDER = 0.3
+"""Order of a style below which its patches are too much like noise to tell where it is carried."""
 LESS = 0.2
 """How much less than the whole surface's coverage a region's must be to be named."""
 
@@ -70,6 +72,8 @@ def verdict(found: Mapping[str, float]) -> str | None:
     rated = f"craft about {found['craft']:.1f} of 5"
     if "coverage" not in found:
         return rated
+    if found["order"] < LEAST_ORDER:
+        return f"match about {found['match']:.1f} of 5, {rated}" if "match" in found else rated
     covered = f"carries the style on {100 * found['coverage']:.0f} % of the surface"
     least = min(REGIONS, key=lambda name: found[f"coverage_{name}"])
     share = found[f"coverage_{least}"]
