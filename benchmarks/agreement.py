@@ -21,6 +21,8 @@ import numpy as np
 from styleexp.experiments import ratings
 from styleexp.experiments.ratings import LEAST_BEND, LEAST_CHANGE, MOST_DISTANCE
 from styleexp.experiments.reports import study_results
+from styleexp.experiments.reports.comparison import sign_test
+from styleexp.experiments.reports.reliability import mean_interval
 from styleexp.experiments.reports.study_results import spearman
 
 DATA = Path(__file__).parents[1] / "reports" / "rated"
@@ -77,6 +79,8 @@ def main() -> int:
             told = [agreement(half, name, sign, column) for half in halves(rows)]
             print(f"  {name:20s}" + "   ".join(f"{s:5.2f}  {100 * p:5.1f} %" for s, p, _ in told))
         print(f"  pairs of results: {', '.join(str(n) for _, _, n in told)}")
+    by_kind(rows)
+    compared(rows, "synthesis", "displacement_map")
     return 0
 
 
@@ -98,6 +102,38 @@ def agreement(rows: Rows, name: str, sign: int, column: str) -> tuple[float, flo
     values = sign * np.array([float(row[1][name]) for row in rows])
     rated = np.array([float(row[0][column]) for row in rows])
     return spearman(values, rated), *ordered(values, rated)
+
+
+def kind_of(run: str) -> str:
+    """How a result was made: the sweep's experiment, or how it was altered."""
+    return run.removeprefix("altered/").split("/")[0]
+
+
+def by_kind(rows: Rows) -> None:
+    """Print each kind's mean match and craft, as rated and as estimated."""
+    print("\nkind: results, match, craft; estimated")
+    found: dict[str, list[tuple[float, ...]]] = {}
+    for rated, row in rows:
+        four = (rated["mean"], rated["craft_mean"], float(row["match"]), float(row["craft"]))
+        found.setdefault(kind_of(rated["run"]), []).append(four)
+    for kind, numbers in sorted(found.items(), key=lambda each: -np.mean(each[1], axis=0)[0]):
+        match, craft, *estimates = np.mean(numbers, axis=0)
+        told = ", ".join(f"{x:.1f}" for x in estimates)
+        print(f"  {kind:20s}{len(numbers):3d}  {match:.1f}  {craft:.1f}  {told}")
+
+
+def compared(rows: Rows, one: str, other: str) -> None:
+    """Print the mean difference of two kinds on the pairs that both have, its 95 % interval
+    (Student's t over the pairs), and the p-value of a permutation of signs."""
+    ratings_of = {
+        kind: {r["pair"]: r for r, _ in rows if kind_of(r["run"]) == kind} for kind in (one, other)
+    }
+    pairs = sorted(ratings_of[one].keys() & ratings_of[other].keys())
+    print(f"\n{one} minus {other}, {len(pairs)} pairs")
+    for question, column in (("match", "mean"), ("craft", "craft_mean")):
+        apart = np.array([ratings_of[one][p][column] - ratings_of[other][p][column] for p in pairs])
+        mean, low, high = mean_interval(apart)
+        print(f"  {question}: {mean:.2f} ({low:.2f} to {high:.2f}), p {sign_test(apart):.3f}")
 
 
 def fit(rows: Rows) -> None:
