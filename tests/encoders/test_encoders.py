@@ -177,6 +177,8 @@ def test_grey_is_three_equal_channels():
 @pytest.mark.parametrize("layers", [PAPER, ["conv1_2", "conv3_4", "conv3_1"]])
 def test_gram_sums_are_those_of_the_activations(precision, pooling, layers, monkeypatch):
     encoder = build(precision=precision, pooling=pooling)
+    if not encoder.is_fused:
+        pytest.skip(f"oneDNN has no convolutions in {precision} on this processor")
     names = encoder.resolve(layers)
     seen = images(3)
     # Two images at once in the first block, all three in later ones.
@@ -346,6 +348,23 @@ def test_bf16_without_gain_is_done_but_said(monkeypatch, caplog):
     monkeypatch.setattr(vgg, "fastest_precision", lambda device: "fp32")
     assert build(precision="bf16").precision == "bf16"
     assert "is not faster" in caplog.text
+
+
+def test_bf16_without_onednn_gives_the_same_sums(monkeypatch):
+    """As on processors without AVX-512."""
+    from styleexp.method.losses import GramLoss
+    from styleexp.method.options import LossConfig
+    from styleexp.method.viewer import Images
+
+    seen = images(2).permute(0, 2, 3, 1).contiguous()
+    shown = Images(seen, torch.ones(seen.shape[:3]))
+    exact = GramLoss(LossConfig(masked=False), build()).describe(shown)
+    monkeypatch.setattr(vgg, "has_onednn", lambda tensor: False)
+    encoder = build(precision="bf16")
+    assert not encoder.is_fused
+    found = GramLoss(LossConfig(masked=False), encoder).describe(shown)
+    for one, other in zip(found, exact, strict=True):
+        assert (one - other).norm() / other.norm() < 0.02
 
 
 def test_paper_normalisation():

@@ -190,20 +190,21 @@ def test_sweep_page_opens_runs_sorts_and_shows_failures(runs, page):
     text = page.find_element("tag name", "main").text
     assert text.count("failed\n") >= 2
     assert "field.sigma=-1" in text  # the reason
-    losses = page.find_elements("css selector", "table.sortable tbody td:nth-child(6)")
-    head = page.find_element("xpath", "//table[@class='sortable']//button[.='loss']")
+    means = page.find_elements("xpath", "//h3[.='Means by field.sigma']/following::table[1]//tr")
+    assert [row.text.split()[:2] for row in means[1:]] == [["-1", "0"], ["2", "2"]]  # finished
+    runs_table = page.find_element("xpath", "//h3[.='All runs']/following::table[1]")
 
     def shown():
-        cells = page.find_elements("css selector", "table.sortable tbody td:nth-of-type(5)")
+        cells = runs_table.find_elements("css selector", "tbody td:nth-of-type(5)")
         return [cell.get_attribute("data-value") for cell in cells]
 
-    assert len(losses) == 4
-    head.click()
+    assert len(shown()) == 4
+    runs_table.find_element("xpath", ".//button[.='loss']").click()
     up = shown()
     numbers = [float(value) for value in up if value]
     assert numbers == sorted(numbers)
     assert up[-2:] == ["", ""]  # what failed has none
-    head.click()
+    runs_table.find_element("xpath", ".//button[.='loss']").click()
     down = [float(value) for value in shown() if value]
     assert down == numbers[::-1]
     page.find_element("css selector", ".entry a").click()

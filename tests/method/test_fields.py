@@ -5,6 +5,7 @@ import torch
 
 from styleexp.experiments.metrics.shape import flipped_faces
 from styleexp.inputs import meshes, shapes
+from styleexp.method import fields
 from styleexp.method.fields import FourierFeatures, FourierMLP, zero_mean
 from styleexp.method.options import FieldConfig
 from styleexp.method.surface import Surface, unfolded
@@ -51,8 +52,11 @@ def test_encoding_follows_points_and_frequencies_that_change_in_place():
     assert encode(points.clone().requires_grad_()).requires_grad
 
 
+@pytest.mark.parametrize("onednn", [True, False])
 @pytest.mark.parametrize("rows", [2, 300])
-def test_bf16_layers_are_those_of_torch(rows):
+def test_bf16_layers_are_those_of_torch(rows, onednn, monkeypatch):
+    if not onednn:  # as on processors without AVX-512
+        monkeypatch.setattr(fields, "has_onednn", lambda tensor: False)
     field = FourierMLP(FieldConfig(width=64, depth=4), generator(), 5.0, 0.1)
     torch.nn.init.normal_(field.last.weight, generator=generator())
     points = torch.rand(rows, 3, generator=generator())

@@ -60,6 +60,9 @@ def spoil(scene, part):
                 local = dataclasses.replace(local, image=later(local.image))
             return whole, local
 
+        def for_step(self, generator):
+            return self
+
         def distance(self, grams, target, scales):
             value = scene.loss.distance(grams, target, scales)
             return later(value) if grams[0].requires_grad else value

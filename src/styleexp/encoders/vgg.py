@@ -21,6 +21,7 @@ from styleexp.inputs.weights import (
     layer_names,
 )
 from styleexp.system.errors import UserError, unknown_name
+from styleexp.system.process import has_onednn
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -182,9 +183,7 @@ class VGG(Encoder):
         """Whether `gram_sums` can be used: on a CPU with oneDNN, after the ReLU, in fp32 or
         bf16."""
         weight = next(self.convs.parameters())
-        has = weight.device.type == "cpu" and torch.backends.mkldnn.is_available()
-        has = has and self.activations == "relu"
-        return has and weight.dtype in fused.BITS
+        return has_onednn(weight) and self.activations == "relu" and weight.dtype in fused.BITS
 
     def gram_sums(
         self,

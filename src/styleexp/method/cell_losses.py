@@ -111,14 +111,15 @@ class CellLoss(LayerLoss):
         ]
 
     def pooled(self, batches: Sequence[Statistics]) -> Statistics:
-        """A sample of all batches' cells, as large as that of one."""
+        """A sample of all batches' cells, as large as that of one: its share of each batch, which
+        `sampled` has in random order, from the front. The order of the batches doesn't matter."""
         found = []
-        for layer, parts in enumerate(zip(*batches, strict=True)):
-            cells = torch.cat([part[part[:, -1] > 0] for part in parts])
-            if len(cells) > self.config.cells:
-                order = torch.randperm(len(cells), generator=self._generator(layer))
-                cells = cells[order[: self.config.cells].to(cells.device)]
-            found.append(padded(cells, self.config.cells))
+        for parts in zip(*batches, strict=True):
+            cells = [part[part[:, -1] > 0] for part in parts]
+            total = sum(map(len, cells))
+            if total > self.config.cells:
+                cells = [each[: self.config.cells * len(each) // total] for each in cells]
+            found.append(padded(torch.cat(cells), self.config.cells))
         return found
 
     @abstractmethod

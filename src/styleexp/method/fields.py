@@ -13,6 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from styleexp.method.large_steps import Diffusion
 from styleexp.system.errors import UserError
+from styleexp.system.process import has_onednn
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -154,8 +155,7 @@ class FourierMLP(Field):
         because neighbouring displacements differ by less than bfloat16 can resolve.
         """
         x = self.encode(points, opened).to(precision)
-        fused = x.device.type == "cpu" and torch.backends.mkldnn.is_available()
-        fused = fused and precision == torch.bfloat16
+        fused = precision == torch.bfloat16 and has_onednn(x)
         for layer in self.hidden:
             assert isinstance(layer, nn.Linear)
             weight, bias = layer.weight.to(precision), layer.bias.to(precision)

@@ -53,6 +53,16 @@ def gpu(device: torch.device) -> dict[str, Any]:
     }
 
 
+def has_onednn(tensor: torch.Tensor) -> bool:
+    """Whether oneDNN's own operators, which torch wouldn't call by itself, take this tensor: on a
+    CPU, and with bfloat16 on none without AVX-512."""
+    import torch
+
+    if tensor.device.type != "cpu" or not torch.backends.mkldnn.is_available():
+        return False
+    return tensor.dtype != torch.bfloat16 or torch.ops.mkldnn._is_mkldnn_bf16_supported()
+
+
 @cache
 def _default_threads() -> int:
     import torch
