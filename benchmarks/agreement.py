@@ -46,7 +46,6 @@ SIGNS = {
     "relief_distance": -1,
     "silhouette_iou": 1,
     "bend": -1,
-    "spike": -1,
     "flipped_faces": -1,
     "self_intersections": -1,
     "chamfer": -1,

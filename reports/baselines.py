@@ -28,7 +28,7 @@ nb.pictures(runs, "method")
 
 # %%
 shown = nb.table(runs, ["style_distance", "relief_distance", "relief_rms", "silhouette_iou",
-                        "self_intersections", "spike"])  # fmt: skip
+                        "self_intersections", "craft"])  # fmt: skip
 nb.save(shown, tables, "baselines")
 nb.show(shown)
 

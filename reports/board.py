@@ -30,7 +30,7 @@ nb.triples(runs)
 
 # %%
 shown = nb.table(
-    runs, ["style_distance", "relief_distance", "relief_rms", "silhouette_iou", "spike"]
+    runs, ["style_distance", "relief_distance", "relief_rms", "silhouette_iou", "craft"]
 )
 nb.save(shown, tables, "board")
 nb.show(shown)

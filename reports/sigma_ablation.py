@@ -34,7 +34,7 @@ if "metric.relief_rms" in runs:
     runs["fineness"] = runs["slope"] / runs["metric.relief_rms"].where(
         runs["metric.relief_rms"] > 0
     )
-shown = nb.table(runs, ["style_distance", "relief_rms", "silhouette_iou", "spike"])
+shown = nb.table(runs, ["style_distance", "relief_rms", "silhouette_iou", "craft"])
 if "fineness" in runs:
     shown["fineness"] = runs["fineness"]
 nb.save(shown, tables, "sigma_ablation")

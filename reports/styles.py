@@ -39,7 +39,7 @@ for number, name in ((2, "mesh_styles"), (3, "multi_style"), (4, "image_styles")
 
 # %%
 shown = nb.table(
-    runs, ["style_distance", "relief_distance", "relief_rms", "silhouette_iou", "spike"]
+    runs, ["style_distance", "relief_distance", "relief_rms", "silhouette_iou", "craft"]
 )
 nb.save(shown, tables, "styles")
 nb.show(shown)

@@ -15,7 +15,7 @@ from styleexp.system.errors import UserError
 pytest.importorskip("pandas", reason="pandas is not installed (extra report)")
 from styleexp.experiments.reports import notebook, notebooks
 
-SMOOTH = {"silhouette_iou": 0.99, "spike": 2.0, "relief_rms": 0.01, "style_distance": 0.5}
+SMOOTH = {"silhouette_iou": 0.99, "craft": 4.0, "relief_rms": 0.01, "style_distance": 0.5}
 
 
 def write_run(folder, overrides, steps=200, **measured):

@@ -16,17 +16,18 @@ if TYPE_CHECKING:
 
 TRUTH_SOURCES = ("sphere", "torus", "critter")
 """Sources of the truth board, all analytic."""
-COLUMNS = ("rank1", "scale", "noise", "strength", "no_style", "imperfect")
+COLUMNS = ("rank1", "scale", "noise", "strength", "no_style", "imperfect", "turned")
 SHOWN = (
     "source",
     "style",
+    "match",
+    "craft",
     "style_distance",
     "relief_distance",
     "looks_like",
     "silhouette_iou",
     "flipped_faces",
     "self_intersections",
-    "spike",
     "status",
 )
 
@@ -197,7 +198,11 @@ def _show_board(found: dict[str, Any]) -> None:
 
 def _show_truth(found: dict[str, Any]) -> None:
     rows = [
-        [name, *(f"{verdict[c]:.3f}" for c in COLUMNS), "yes" if verdict["kept"] else "no"]
+        [
+            name,
+            *(f"{verdict[c]:.3f}" if c in verdict else "" for c in COLUMNS),
+            "yes" if verdict["kept"] else "no",
+        ]
         for name, verdict in found["metrics"].items()
     ]
     _table(["metric", *COLUMNS, "kept"], rows)

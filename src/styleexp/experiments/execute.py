@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from styleexp.method.base import Method, Result, Scene, State, Step
     from styleexp.plugins.loggers import Loggers
 
-SHOWN_METRICS = ("style_distance", "silhouette_iou", "flipped_faces", "spike")
+SHOWN_METRICS = ("style_distance", "silhouette_iou", "flipped_faces")
 """Metrics printed at the end of a run."""
 INTERRUPTED = 130
 """Exit code of a run that the user stopped, as of a program that Ctrl-C ends."""

@@ -14,7 +14,7 @@ import torch
 
 from styleexp.experiments import ratings
 from styleexp.experiments.metrics.likeness import Bank, bank_of, likeness
-from styleexp.experiments.metrics.shape import bend, content, spike
+from styleexp.experiments.metrics.shape import bend, content
 from styleexp.experiments.metrics.style import (
     Looks,
     judged,
@@ -133,7 +133,7 @@ def measure(
             found["relief_distance"] = apart
             if bank is not None:
                 found["match"] = ratings.match(found)
-    return found | shape | {"spike": spike(_moved(source, vertices, faces))}
+    return found | shape
 
 
 def bank_for(
@@ -175,15 +175,6 @@ def raised(source: meshes.Mesh, vertices: np.ndarray, faces: np.ndarray) -> Reli
     else:
         base, normals = closest(own, source.faces, result)
     return Relief(base, faces, ((result - base) * normals).sum(axis=1))
-
-
-def _moved(source: meshes.Mesh, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Signed distance of each vertex from its source position or, with other faces, from the
-    source's surface."""
-    base = source.vertices
-    if not np.array_equal(faces, source.faces):
-        base, _ = closest(source.vertices, source.faces, vertices)
-    return np.linalg.norm(vertices - base, axis=1)
 
 
 def _rms(values: np.ndarray) -> float:

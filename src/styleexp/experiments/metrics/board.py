@@ -81,7 +81,6 @@ def measure_board(folder: Path, judge: Judge, write: bool = False) -> dict[str, 
         "styles": len(goals),
         "min_silhouette_iou": min((row["silhouette_iou"] for row in done), default=None),
         "max_flipped": max((row.get("flipped_faces", 0.0) for row in done), default=None),
-        "max_spike": max((row["spike"] for row in done), default=None),
         "runs": rows,
     }
 

@@ -124,15 +124,6 @@ def flipped_faces(
     return float(((before * after).sum(axis=1) < 0).mean())
 
 
-def spike(displacement: Float[np.ndarray, " vertices"]) -> float:
-    """99.9th percentile of |d| divided by the RMS of d; large if a few vertices stand out.
-
-    0 without displacement.
-    """
-    root = float(np.sqrt(np.square(displacement).mean()))
-    return float(np.percentile(np.abs(displacement), 99.9)) / root if root > 0 else 0.0
-
-
 def bend(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> float:
     """99th percentile, over the edges, of the difference of the unit normals at an edge's ends: 0
     for a smooth surface, up to 2 where it is crumpled."""

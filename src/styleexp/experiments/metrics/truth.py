@@ -5,7 +5,7 @@ projection, without rendering or learning. Distractors are added: the same style
 scale, at a quarter of its height, noise of the same energy and frequency, the plain source, and a
 shrunken one. A style metric must rank the true style nearest, find no style where there is none,
 and prefer the right scale. Since optimisation never yields the pure style, it should also recognise
-it at half height, with noise, and in patches.
+it at half height, with noise, and in patches; and turned, as a relief that follows limbs is.
 
 Images have a separate board. An image's true relief is unknown, so the method's assumption is used:
 bright is high.
@@ -21,7 +21,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from styleexp.config.compose import compose
 from styleexp.config.schema import Config
+from styleexp.experiments.metrics import bank_for
+from styleexp.experiments.metrics.likeness import Bank, likeness
 from styleexp.experiments.metrics.style import (
     LAYERS,
     Looks,
@@ -63,6 +66,8 @@ SHRINKAGE = 0.03
 PATCHES = 0.8
 """Frequency of a patchy result's patches, in cycles per radius of the source; half is covered."""
 IMPERFECT = ("low", "noisy", "patchy")
+TURN = math.radians(60)
+"""Angle of the turned style. No analytic style but ``buckyball`` is alike after it."""
 PICTURE_RELIEF = 0.03
 """RMS height of an image applied to a source, in pattern units."""
 PICTURE_FREQUENCY = 3.0
@@ -81,6 +86,10 @@ class Sample:
     """Grams of the height images, by an encoder with random weights."""
     views: Grams
     """Grams of whole renders, foreground only."""
+    laid: tuple[Relief, float] | None = None
+    """A result's heights above its source, and the pattern's size there."""
+    bank: Bank | None = None
+    """A style's patches."""
 
 
 @dataclass
@@ -102,11 +111,13 @@ CANDIDATES: dict[str, Metric] = {
     "style_distance": lambda r, s, p, own: style_distance(r.looks, s.looks, p.looks),
     "relief_distance": lambda r, s, p, own: relief_distance(r.looks, s.looks) or 0.0,
     "appearance_distance": lambda r, s, p, own: appearance_distance(r.looks, s.looks),
+    "unlikeness": lambda r, s, p, own: _unlikeness(r, s),
     "gram_distance": lambda r, s, p, own: gram_distance(r.looks, s.looks, p.looks),
     "random_gram_distance": lambda r, s, p, own: _ratio(r.random, s.random, p.random),
     "view_distance": lambda r, s, p, own: _ratio(r.views, s.views, own.views),
 }
-"""Candidate metrics; smaller is nearer. The last three are only for comparison."""
+"""Candidate metrics; smaller is nearer. ``unlikeness`` is 1 - `likeness`. The last three are only
+for comparison."""
 
 
 PICTURE_CANDIDATES = {
@@ -121,19 +132,26 @@ def wrapped(
     normals: Float[np.ndarray, "points 3"],
     unit: float,
     rng: np.random.Generator,
+    angle: float = 0.0,
 ) -> Float[np.ndarray, " points"]:
     """An analytic style's relief on another surface; ``unit`` is the style's radius there.
 
     The style's sphere is unrolled around its equator onto each of three planes, and the three
-    heights are blended by the normal; +Y stays up where possible.
+    heights are blended by the normal; +Y stays up where possible, or is turned by ``angle``
+    radians.
     """
     weights = np.abs(normals) ** SHARPNESS
     weights /= weights.sum(axis=1, keepdims=True)
     total = np.zeros(len(points))
     for axis, (right, up, turn) in enumerate(((2, 1, -1.0), (0, 2, -1.0), (0, 1, 1.0))):
         side = np.where(normals[:, axis] < 0, -turn, turn)
-        longitude = side * points[:, right] / unit + rng.uniform(0, 2 * math.pi)
-        rolled = np.mod(points[:, up] / unit + rng.uniform(0, 4 * BELT), 4 * BELT)
+        across, along = side * points[:, right] / unit, points[:, up] / unit
+        across, along = (
+            math.cos(angle) * across - math.sin(angle) * along,
+            math.sin(angle) * across + math.cos(angle) * along,
+        )
+        longitude = across + rng.uniform(0, 2 * math.pi)
+        rolled = np.mod(along + rng.uniform(0, 4 * BELT), 4 * BELT)
         latitude = np.where(rolled < 2 * BELT, rolled - BELT, 3 * BELT - rolled)
         directions = np.stack(
             [
@@ -168,10 +186,11 @@ def cases(
     rng = np.random.default_rng(seed)
     normals = meshes.vertex_normals(source.vertices, source.faces)
 
-    def laid(unit: float) -> Float[np.ndarray, " vertices"]:
-        return wrapped(style, source.vertices, normals, unit, rng)
+    def laid(unit: float, angle: float = 0.0) -> Float[np.ndarray, " vertices"]:
+        return wrapped(style, source.vertices, normals, unit, rng, angle)
 
     yield from _variants(laid, source.vertices, unit, frequency, rng)
+    yield "turned", laid(unit, TURN)
 
 
 def picture_cases(
@@ -223,11 +242,14 @@ def measure_board(
     encoder = load_encoder(judge)
     random = load_encoder("vgg19_random")
 
-    def sample(relief: Relief, unit: float, vertices: np.ndarray, faces: np.ndarray) -> Sample:
+    def sample(
+        relief: Relief, unit: float, vertices: np.ndarray, faces: np.ndarray, **more: Any
+    ) -> Sample:
         return Sample(
             judged(relief, unit, encoder, count),
             height_grams(random, windows(relief, WINDOW * unit, count)),
             _view_grams(encoder, vertices, faces),
+            **more,
         )
 
     board = Board()
@@ -237,7 +259,8 @@ def measure_board(
     }
     for name, style in meshes_of.items():
         vertices = meshes.normalisation(style.vertices).apply(style.vertices)
-        board.styles[name] = sample(relief_of_mesh(style), 1.0, vertices, style.faces)
+        bank = bank_for(compose([f"style={name}"]), style, Style.of(style), {})
+        board.styles[name] = sample(relief_of_mesh(style), 1.0, vertices, style.faces, bank=bank)
     height = judged_plain(random).height
     assert height is not None
     board.plain = Sample(judged_plain(encoder), height, [])
@@ -253,7 +276,10 @@ def measure_board(
             for what, moved in cases(source, name, unit, frequencies[name], seed):
                 vertices = source.vertices + moved[:, None] * normals
                 relief = relief_of_result(source, vertices, source.faces, unit)
-                board.cases[given.name, name, what] = sample(relief, unit, vertices, source.faces)
+                laid = (Relief(source.vertices, source.faces, moved), unit)
+                board.cases[given.name, name, what] = sample(
+                    relief, unit, vertices, source.faces, laid=laid
+                )
             report(f"{given.name}, {name}")
     return board
 
@@ -298,14 +324,15 @@ def judge_metrics(
     half and double. ``noise``, ``strength``: it is nearer than noise, and than at a quarter of its
     height. ``no_style``: the shrunken source is farther than the true result and, for ratio
     metrics, within a tenth of 1. ``imperfect``: like ``rank1``, for results at half height, with
-    noise, in patches. ``confusions`` lists the errors for the true style.
+    noise, in patches; ``turned``: for turned ones, if there are any. ``confusions`` lists the
+    errors for the true style.
     """
     return {name: _verdict(metric, board) for name, metric in candidates.items()}
 
 
 def _verdict(metric: Metric, board: Board) -> dict[str, Any]:
     right = dict.fromkeys(("rank1", "scale", "noise", "strength", "no_style"), 0)
-    recognised = 0
+    recognised, turned = 0, list[bool]()
     confusions = []
     true = [key for key in board.cases if key[2] == "true"]
     plain = board.plain
@@ -323,6 +350,8 @@ def _verdict(metric: Metric, board: Board) -> dict[str, Any]:
         value = far("true")
         nearest = nearest_to("true")
         recognised += sum(nearest_to(what) == style for what in IMPERFECT)
+        if (source, style, "turned") in board.cases:
+            turned.append(nearest_to("turned") == style)
         right["rank1"] += nearest == style
         right["scale"] += value < min(far("half"), far("double"))
         right["noise"] += value < far("noise")
@@ -333,6 +362,8 @@ def _verdict(metric: Metric, board: Board) -> dict[str, Any]:
             confusions.append(f"{source}: {style} mistaken for {nearest}")
     shares = {key: count / len(true) for key, count in right.items()}
     shares["imperfect"] = recognised / (len(true) * len(IMPERFECT))
+    if turned:
+        shares["turned"] = sum(turned) / len(turned)
     kept = min(shares["rank1"], shares["scale"], shares["no_style"]) >= ENOUGH
     return {**shares, "kept": kept, "confusions": confusions}
 
@@ -351,6 +382,14 @@ def _view_grams(encoder: Encoder, vertices: np.ndarray, faces: np.ndarray) -> Gr
         gram_matrix(f.float(), layer_mask(out.coverage, (f.shape[2], f.shape[3]), erosion=2))
         for f in (features[layer] for layer in LAYERS)
     ]
+
+
+def _unlikeness(result: Sample, style: Sample) -> float:
+    """1 minus the result's mean likeness; 1 on a plain source."""
+    if result.laid is None:
+        return 1.0
+    assert style.bank is not None
+    return 1.0 - float(likeness(style.bank, *result.laid).carried.mean())
 
 
 def _ratio(result: Grams, style: Grams, own: Grams) -> float:

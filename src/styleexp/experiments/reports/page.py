@@ -46,7 +46,6 @@ MEANINGS = {
     "volume_change": "relative to the source's volume",
     "flipped_faces": "fraction of faces that are flipped",
     "self_intersections": "fraction of faces that intersect another one",
-    "spike": "largest displacements relative to the RMS; large if few vertices stand out",
 }
 """Short descriptions of the metrics in `styleexp.experiments.metrics`."""
 FILES = (
