@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import math
+from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -57,14 +60,37 @@ class Synthesis(Method[Scene]):
 
     def finish(self, scene: Scene, state: State | None) -> Result:
         """Displace the source by the relief, with zero mean over the surface."""
-        subject, settings = scene.subject, scene.subject.settings
+        subject = scene.subject
         if subject.smooth:
             still = np.zeros(len(subject.source.vertices))
             return Result(subject, still, subject.source.vertices.copy())
-        displacement = masked(relief(subject, self.config, settings.strength), subject.mask)
-        if settings.field.unfold:
-            displacement = unfolded(subject.surface, displacement)
-        return displaced(subject, displacement)
+        begun = begin(subject)
+        height = deque(heights(subject, begun, self.config), maxlen=1).pop()
+        return self.laid(subject, begun, height)
+
+    def laid(self, subject: Subject, begun: Begun, height: Float[Tensor, " vertices"]) -> Result:
+        """Displace the source by these heights; see `heights`."""
+        found = displacement(subject, begun, height, self.config, subject.settings.strength)
+        found = masked(found, subject.mask)
+        if subject.settings.field.unfold:
+            found = unfolded(subject.surface, found)
+        return displaced(subject, found)
+
+
+@dataclass(frozen=True)
+class Begun:
+    """What the synthesis starts from: the style's pattern, and the source to put it on."""
+
+    exemplar: MeshExemplar | PictureExemplar
+    pattern: Pattern
+    sheet: Sheet
+    rng: np.random.Generator
+    """Copied before each use, so that every synthesis draws the same numbers."""
+
+    @property
+    def directed(self) -> bool:
+        """Whether the pattern has a direction."""
+        return self.pattern.directed > DIRECTED
 
 
 def relief(
@@ -72,6 +98,13 @@ def relief(
 ) -> Float[Tensor, " vertices"]:
     """The style's relief at the source's vertices, scaled by ``strength``, in radii of the
     normalised source, with zero mean over the surface."""
+    begun = begin(subject)
+    height = deque(heights(subject, begun, config), maxlen=1).pop()
+    return displacement(subject, begun, height, config, strength)
+
+
+def begin(subject: Subject) -> Begun:
+    """Measure the style's pattern, and prepare the source for walking."""
     rng = np.random.default_rng(subject.settings.optim.seed)
     doing("measuring the style's pattern")
     exemplar = exemplar_of_style(subject)
@@ -80,29 +113,48 @@ def relief(
     sheet = Sheet(
         surface.vertices.cpu().numpy(), subject.source.faces, surface.normals.cpu().numpy()
     )
-    directed = pattern.directed > DIRECTED
-    ahead = directions(subject, sheet, directed)
-    levels = levels_of(pattern, sheet.edge / subject.unit)
-    tell(summary(subject, pattern, directed, levels))
+    return Begun(exemplar, pattern, sheet, rng)
 
-    height = torch.zeros(len(sheet.vertices))
+
+def heights(
+    subject: Subject, begun: Begun, config: SynthesisConfig
+) -> Iterator[Float[Tensor, " vertices"]]:
+    """Synthesise the pattern on the source: the vertices' heights, in units of the pattern, after
+    every round. The last are the result."""
+    rng = copy.deepcopy(begun.rng)
+    ahead = directions(subject, begun.sheet, begun.directed)
+    levels = levels_of(begun.pattern, begun.sheet.edge / subject.unit)
+    tell(summary(subject, begun.pattern, begun.directed, levels))
     total = sum(level.rounds for level in levels)
-    for number, height in synthesise(  # noqa: B007  the last is the result
-        sheet, ahead, exemplar, levels, subject.unit, not directed, rng, most=config.bank
-    ):
+    found = synthesise(
+        begun.sheet, ahead, begun.exemplar, levels, subject.unit, not begun.directed, rng,
+        most=config.bank,
+    )  # fmt: skip
+    for number, height in found:
         doing(f"synthesising the relief, round {number} of {total}")
+        yield height
+
+
+def displacement(
+    subject: Subject,
+    begun: Begun,
+    height: Float[Tensor, " vertices"],
+    config: SynthesisConfig,
+    strength: float,
+) -> Float[Tensor, " vertices"]:
+    """Heights as displacements, scaled by ``strength``, in radii of the normalised source: faded
+    where there is no room, with zero mean over the surface."""
+    sheet = begun.sheet
     even = smoother(sheet.vertices, sheet.faces, EVEN * sheet.edge)
-    height = torch.from_numpy(even(height.numpy()))
-    displacement = height * subject.unit * strength
-    displacement *= torch.from_numpy(fade(sheet, half_range(displacement.numpy())))
+    moved = torch.from_numpy(even(height.numpy())) * subject.unit * strength
+    moved *= torch.from_numpy(fade(sheet, half_range(moved.numpy())))
     if config.flatten:
-        own = mesh_relief(
-            sheet.vertices, sheet.faces, sheet.normals, pattern.wavelength * subject.unit
-        )
-        most = float(displacement.abs().max())
-        displacement -= config.flatten * torch.from_numpy(own.clip(-most, most))
-    displacement = zero_mean(displacement, subject.weights.cpu().double(), math.inf)
-    return displacement.to(surface.vertices.device)
+        wavelength = begun.pattern.wavelength * subject.unit
+        own = mesh_relief(sheet.vertices, sheet.faces, sheet.normals, wavelength)
+        most = float(moved.abs().max())
+        moved -= config.flatten * torch.from_numpy(own.clip(-most, most))
+    moved = zero_mean(moved, subject.weights.cpu().double(), math.inf)
+    return moved.to(subject.surface.vertices.device)
 
 
 def directions(subject: Subject, sheet: Sheet, directed: bool) -> Float[np.ndarray, "vertices 3"]:
