@@ -13,6 +13,7 @@ import styleexp
 PACKAGE = Path(styleexp.__file__).parent
 LAYERS = (
     ("cli",),
+    ("studio",),
     ("api", "testing"),
     ("experiments",),
     ("runs",),

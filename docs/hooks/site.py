@@ -39,7 +39,7 @@ API = {
                                "experiments.reports.reliability", "experiments.reports.study_results", "experiments.sweeps.claim", "experiments.sweeps.plan", "experiments.sweeps.runner", "experiments.agreement", "method.gram_cache", "experiments.bench.render", "experiments.bench.step"),
 }  # fmt: skip
 COMMANDS = ("styleexp-assets", "styleexp-bake", "styleexp-bench", "styleexp-metrics",
-            "styleexp-plugins", "styleexp-report", "styleexp-report study", "styleexp-sweep")  # fmt: skip
+            "styleexp-plugins", "styleexp-report", "styleexp-report study", "styleexp-studio", "styleexp-sweep")  # fmt: skip
 EXTERNAL = re.compile(
     r"""<(?:script|img|iframe|source|video|audio)\b[^>]*\bsrc=["']?(?:https?:)?//[^"'\s>]*"""
     r"""|<link\b(?=[^>]*\brel=["']?(?:stylesheet|preload|preconnect|icon|prefetch|modulepreload))"""

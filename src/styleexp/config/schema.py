@@ -63,6 +63,9 @@ class Config(Settings):
     name. ``logger=tensorboard``, ``logger=mlflow`` or ``'logger=[tensorboard,mlflow]'``."""
     report: bool = True
     """Write the run's page, ``report.html``: about 3 MB and 1 s for 20 000 faces."""
+    formats: list[str] = option(factory=list, choices=("stl", "3mf"))
+    """Formats in which the result is written besides PLY, OBJ and GLB: ``formats=[stl,3mf]``, for
+    printing."""
     device: str = "auto"
     """``auto`` (CUDA if available and if the renderer can use it), ``cpu``, ``cuda`` or
     ``cuda:N``."""

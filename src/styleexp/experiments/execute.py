@@ -311,14 +311,15 @@ def _write_results(
     from styleexp.experiments.ratings import verdict
     from styleexp.runs import previews
 
-    for name in ("result.ply", "result.obj", "result.glb"):
+    also = [f"result.{kind}" for kind in config.formats]
+    for name in ("result.ply", "result.obj", "result.glb", *also):
         doing(f"writing {name}")
         result.save(folder.path / name)
     doing("drawing the preview and the turntable")
     size, frames = config.preview.resolution, config.preview.turntable_frames
     folder.write("preview.png", lambda path: previews.write_preview(result, size, path))
     folder.write("turntable.gif", lambda path: previews.write_turntable(result, frames, size, path))
-    names = ("preview.png", "turntable.gif", "result.glb", "result.ply", "result.obj")
+    names = ("preview.png", "turntable.gif", "result.glb", "result.ply", "result.obj", *also)
     written = [folder.path / name for name in names]
     doing("measuring the result")
     measured = _measure(result, config)

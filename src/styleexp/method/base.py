@@ -103,7 +103,7 @@ class Result:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write M as PLY (with the displacement as a vertex attribute), OBJ or GLB."""
+        """Write M as PLY (with the displacement as a vertex attribute), OBJ, GLB, STL or 3MF."""
         meshes.save_mesh(self.subject.source, self.vertices, path, self.displacement)
 
 

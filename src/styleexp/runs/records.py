@@ -35,6 +35,8 @@ FILES = (
     "result.ply",
     "result.obj",
     "result.glb",
+    "result.stl",
+    "result.3mf",
     "preview.png",
     "turntable.gif",
     "check.png",

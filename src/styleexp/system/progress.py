@@ -31,6 +31,11 @@ def doing(what: str, at_once: bool = False) -> None:
         print(f"{what} ...", flush=True)
 
 
+def stage() -> str:
+    """The stage that was announced last, empty between stages."""
+    return _stage[0]
+
+
 def tell(what: str) -> None:
     """Print a finding on the command line; silent for Python callers."""
     if _listening:

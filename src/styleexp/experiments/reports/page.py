@@ -52,6 +52,8 @@ FILES = (
     ("result.glb", "the result, for viewers and engines"),
     ("result.ply", "with the displacement as a vertex attribute"),
     ("result.obj", "with the input file's own vertices"),
+    ("result.stl", "for printing, in the source's units"),
+    ("result.3mf", "for printing, one unit of the source a millimetre"),
     ("preview.png", "four views of source, style and result"),
     ("turntable.gif", "a turntable of the result"),
     ("run.json", "all inputs of the run"),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import os
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,13 +25,18 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 
+SUFFIXES = (".ply", ".obj", ".glb", ".stl", ".3mf")
+"""Formats that can be written."""
+
+
 def save_mesh(
     mesh: Mesh,
     vertices: Float[np.ndarray, "vertices 3"],
     path: str | os.PathLike[str],
     displacement: Float[np.ndarray, " vertices"] | None = None,
 ) -> None:
-    """Write a mesh with moved vertices, as PLY (binary), OBJ or GLB by ``path``'s extension.
+    """Write a mesh with moved vertices, as PLY (binary), OBJ, GLB, STL (binary) or 3MF by
+    ``path``'s extension.
 
     ``vertices`` replace `Mesh.vertices`, in the same frame. The input file's rows are preserved:
     texture coordinates with their seams, materials and images, colours, part names, winding. A GLB
@@ -42,10 +49,12 @@ def save_mesh(
     - GLB: a glTF input's own document, with new positions and normals (if it has normals) and
       without tangents; otherwise one node per part. ``displacement`` is the custom attribute
       ``_DISPLACEMENT``, in the mesh's own units regardless of node scales.
+    - STL, 3MF: for printing, geometry alone, welded, wound outwards. A 3MF needs a unit: one of the
+      mesh's own is a millimetre.
 
-    PLY and GLB use single precision, but a PLY whose source has doubles uses doubles. Every file is
-    replaced atomically, so an interrupted run leaves no partial files. Raises `UserError` if the
-    path isn't writable, the extension is unknown or values are not finite.
+    PLY, GLB and STL use single precision, but a PLY whose source has doubles uses doubles. Every
+    file is replaced atomically, so an interrupted run leaves no partial files. Raises `UserError`
+    if the path isn't writable, the extension is unknown or values are not finite.
     """
     path = Path(path)
     kind = path.suffix.lower()
@@ -59,16 +68,22 @@ def save_mesh(
             f"'{path}' was not written: the result has NaN or infinite vertices because the run "
             "diverged; lower the learning rate."
         )
-    if kind not in (".ply", ".obj", ".glb"):
-        raise UserError(f"'{path}' cannot be written: supported formats are .ply, .obj, .glb.")
-    if kind != ".obj" and np.abs(vertices).max() > np.finfo(np.float32).max:
+    if kind not in SUFFIXES:
+        raise UserError(f"'{path}' cannot be written: supported formats are {', '.join(SUFFIXES)}.")
+    if kind not in (".obj", ".3mf") and np.abs(vertices).max() > np.finfo(np.float32).max:
         raise UserError(
             f"'{path}' cannot store such large coordinates: save as OBJ or scale the mesh down."
         )
     carrier = mesh.carrier or Carrier(
         mesh.faces, np.arange(len(vertices)), np.zeros(len(mesh.faces), bool), parts=(mesh.name,)
     )
-    if kind == ".ply":
+    if kind == ".stl":
+        files = {
+            path.name: trimesh.Trimesh(vertices, mesh.faces, process=False).export(None, "stl")
+        }
+    elif kind == ".3mf":
+        files = {path.name: _3mf(vertices, mesh.faces)}
+    elif kind == ".ply":
         files = {path.name: _ply(carrier, mesh, vertices, displacement)}
     elif kind == ".obj":
         files = _obj(carrier, mesh, vertices, path)
@@ -144,6 +159,44 @@ def _ply(
             normals = np.where(near[rows][:, None], new, carrier.normals[first])
     values = None if displacement is None else np.asarray(displacement)[rows]
     return ply_of(carrier, first, combined[carrier.corners], points, normals, values)
+
+
+def _3mf(vertices: np.ndarray, faces: np.ndarray) -> bytes:
+    """A package with one object: the core specification's model, its type and its relation."""
+    points = "".join(
+        f'<vertex x="{x:.9g}" y="{y:.9g}" z="{z:.9g}"/>' for x, y, z in vertices.tolist()
+    )
+    corners = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in faces.tolist())
+    schemas = "http://schemas.openxmlformats.org/package/2006"
+    model = (
+        '<model unit="millimeter" xml:lang="en-US" '
+        'xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">'
+        '<resources><object id="1" type="model"><mesh>'
+        f"<vertices>{points}</vertices><triangles>{corners}</triangles>"
+        '</mesh></object></resources><build><item objectid="1"/></build></model>'
+    )
+    types = (
+        f'<Types xmlns="{schemas}/content-types">'
+        '<Default Extension="rels" '
+        'ContentType="application/vnd.openxmlformats-package.relationships+xml"/>'
+        '<Default Extension="model" '
+        'ContentType="application/vnd.ms-package.3dmanufacturing-3dmodel+xml"/></Types>'
+    )
+    relation = (
+        f'<Relationships xmlns="{schemas}/relationships"><Relationship Target="/3D/3dmodel.model" '
+        'Id="rel0" Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/>'
+        "</Relationships>"
+    )
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as package:
+        for name, text in (
+            ("[Content_Types].xml", types), ("_rels/.rels", relation), ("3D/3dmodel.model", model)
+        ):  # fmt: skip
+            # With a date of its own, so that equal meshes make equal files.
+            entry = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            package.writestr(entry, f'<?xml version="1.0" encoding="UTF-8"?>\n{text}')
+    return out.getvalue()
 
 
 # --------------------------------------------------------------------------------------------- OBJ

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from styleexp.method.base import State
     from styleexp.method.baselines.options import SynthesisConfig
     from styleexp.method.subject import Subject
+    from styleexp.method.synthesis.exemplar import Exemplar
 
 DIRECTED = 0.25
 """A pattern has a direction if its `Pattern.directed` exceeds this."""
@@ -81,7 +82,7 @@ class Synthesis(Method[Scene]):
 class Begun:
     """What the synthesis starts from: the style's pattern, and the source to put it on."""
 
-    exemplar: MeshExemplar | PictureExemplar
+    exemplar: Exemplar
     pattern: Pattern
     sheet: Sheet
     rng: np.random.Generator

@@ -1,0 +1,226 @@
+(async function () {
+  const RANGES = ["strength", "scale", "rotation", "falloff"];
+  const root = byId("studio"), shown = {};
+  let state = null, queue = {}, timer = null, gone = false;
+
+  async function ask(path, options) {
+    const answer = await fetch(path, options);
+    const found = await answer.json().catch(() => ({}));
+    if (!answer.ok) throw new Error(found.error || `the studio answered ${answer.status}`);
+    return found;
+  }
+  const post = (path, given = {}) =>
+    ask(path, { method: "POST", body: JSON.stringify(given), headers: { "Content-Type": "application/json" } });
+  function complain(message) {
+    byId("error").textContent = message;
+    byId("error").hidden = !message;
+  }
+  async function attempt(act) {
+    complain("");
+    try { return await act(); } catch (error) { complain(error.message); }
+  }
+
+  // ---------------------------------------------------------------- controls to settings
+  const toSetting = { scale: (x) => Number((2 ** x).toFixed(3)) }, toControl = { scale: Math.log2 };
+  function change(name, value) {
+    queue[name] = value;
+    clearTimeout(timer);
+    timer = setTimeout(() => {
+      const given = queue;
+      queue = {};
+      timer = null;
+      attempt(() => post("settings", given));
+    }, 250);
+  }
+  const label = (name, value) => (name === "rotation" ? `${value}°` : `${value}`);
+  for (const name of RANGES)
+    byId(name).addEventListener("input", () => {
+      const value = (toSetting[name] || Number)(Number(byId(name).value));
+      document.querySelector(`output[for=${name}]`).value = label(name, value);
+      change(name, value);
+    });
+  for (const name of ["direction", "mask"]) byId(name).addEventListener("change", () => change(name, byId(name).value));
+  byId("invert").addEventListener("change", () => change("invert", byId("invert").checked));
+  byId("steps").addEventListener("change", () => change("steps", Number(byId("steps").value)));
+  byId("again").addEventListener("click", () => change("seed", state.settings.seed + 1));
+  byId("where").addEventListener("change", () => {
+    const own = byId("where").value === "own";
+    byId("mask-label").hidden = !own;
+    if (own) byId("mask").focus();
+    else change("mask", byId("where").value);
+  });
+  byId("learn").addEventListener("click", () => attempt(() => post(learning() ? "stop" : "learn")));
+  const learning = () => /learning/.test(state.stage);
+
+  // ---------------------------------------------------------------- files
+  const MAIN = { source: /\.(obj|ply|stl|off|glb|gltf)$/i, style: /\.(obj|ply|stl|off|glb|gltf|png|jpe?g|webp|tiff?|bmp|gif|avif|jp2)$/i };
+  async function take(kind, files) {
+    // What lies beside a mesh goes first; of several files a mesh is meant, not its textures.
+    const of = (pattern) => files.find((file) => pattern.test(file.name));
+    const main = of(MAIN.source) || of(MAIN[kind]) || files[0];
+    if (!main) return;
+    await attempt(async () => {
+      for (const file of [...files.filter((each) => each !== main), main]) {
+        byId("stage-line").textContent = `reading ${file.name} …`;
+        const place = file === main ? kind : "beside";
+        await ask(`files/${place}/${encodeURIComponent(file.name)}`, { method: "PUT", body: file });
+      }
+    });
+  }
+  for (const kind of ["source", "style"]) {
+    const drop = byId(`drop-${kind}`);
+    for (const over of ["dragenter", "dragover"])
+      drop.addEventListener(over, (event) => { event.preventDefault(); drop.classList.add("over"); });
+    drop.addEventListener("dragleave", () => drop.classList.remove("over"));
+    drop.addEventListener("drop", (event) => {
+      event.preventDefault();
+      drop.classList.remove("over");
+      take(kind, [...event.dataTransfer.files]);
+    });
+    byId(`file-${kind}`).addEventListener("change", (event) => take(kind, [...event.target.files]));
+    byId(`known-${kind}`).addEventListener("change", (event) => {
+      if (event.target.value) change(kind, event.target.value);
+      event.target.value = "";
+    });
+  }
+  // A file dropped beside its place must not replace the page.
+  for (const kind of ["dragover", "drop"]) addEventListener(kind, (event) => event.preventDefault());
+
+  // ---------------------------------------------------------------- saving
+  byId("save").addEventListener("click", () => attempt(async () => {
+    const formats = [...document.querySelectorAll("#formats input:checked")].map((box) => box.value);
+    byId("save").disabled = true;
+    byId("save-hint").textContent = "saving …";
+    try {
+      const { files } = await post("save", { formats });
+      byId("saved").replaceChildren(...files.map(({ name, path }) => {
+        const item = document.createElement("li"), link = document.createElement("a");
+        link.href = `saved/${encodeURIComponent(name)}`;
+        link.download = name;
+        link.textContent = path;
+        item.append(link);
+        return item;
+      }));
+      byId("saved").dataset.count = files.length;
+    } finally {
+      byId("save-hint").textContent = "";
+      update();
+    }
+  }));
+  byId("copy").addEventListener("click", async () => {
+    getSelection().selectAllChildren(byId("command"));
+    try { await navigator.clipboard.writeText(byId("command").textContent); byId("copy").textContent = "Copied"; }
+    catch { byId("copy").textContent = "Selected"; }
+  });
+  byId("before").addEventListener("click", () => {
+    const on = byId("before").getAttribute("aria-pressed") !== "true";
+    byId("before").setAttribute("aria-pressed", String(on));
+    byId("stage").classList.toggle("before", on);
+  });
+  const views = [byId("view-result"), byId("view-source")];
+  const link = linkCameras(views, () => true);
+  byId("home").addEventListener("click", () => {
+    link.release();
+    for (const viewer of views) aim(viewer, HOME.orbit, HOME.target, HOME.field);
+  });
+
+  // ---------------------------------------------------------------- from the studio to the page
+  const WHERE = [["", "the whole surface"], ["height:0.5..1", "upper half"], ["height:0..0.5", "lower half"],
+    ["slope:60", "what faces up"], ["not:slope:60", "what doesn't face up"]];
+  function places() {
+    const attributes = state.source?.attributes || [];
+    const all = [...WHERE, ...attributes.flatMap((name) =>
+      [[`attribute:${name}`, `where ${name} is high`], [`not:attribute:${name}`, `where ${name} is low`]]), ["own", "own terms …"]];
+    const key = JSON.stringify(all);
+    if (byId("where").dataset.key !== key) {
+      byId("where").dataset.key = key;
+      byId("where").replaceChildren(...all.map(([value, text]) => new Option(text, value)));
+    }
+    const mask = state.settings.mask, known = all.some(([value]) => value === mask);
+    if (document.activeElement !== byId("mask") && document.activeElement !== byId("where")) {
+      byId("where").value = known ? mask : "own";
+      byId("mask-label").hidden = known;
+      byId("mask").value = mask;
+    }
+    byId("falloff-label").hidden = !mask;
+    const direction = byId("direction");
+    for (const name of attributes)
+      if (![...direction.options].some((each) => each.value === `attribute:${name}`))
+        direction.add(new Option(`attribute ${name}`, `attribute:${name}`));
+  }
+
+  function update() {
+    const { settings } = state, busy = !["done", "failed"].includes(state.stage);
+    root.classList.toggle("busy", busy);
+    byId("stage-line").textContent = state.stage === "done" ? (state.finished ? "Done" : "Stopped")
+      : state.stage + (/^preparing/.test(state.stage) && state.detail ? `: ${state.detail}` : "");
+    byId("size-line").textContent = state.result ? `${state.result.vertices.toLocaleString()} vertices` +
+      (state.learned ? `, ${state.learned} steps learned` : "") : "";
+    if (state.error) complain(state.error);
+    if (!timer) {
+      for (const name of RANGES) {
+        if (document.activeElement === byId(name)) continue;
+        byId(name).value = (toControl[name] || Number)(settings[name]);
+        document.querySelector(`output[for=${name}]`).value = label(name, settings[name]);
+      }
+      for (const name of ["direction", "steps"]) if (document.activeElement !== byId(name)) byId(name).value = settings[name];
+      byId("invert").checked = settings.invert;
+    }
+    byId("seed").textContent = settings.seed;
+    byId("invert-label").hidden = !state.style?.picture;
+    byId("learn").textContent = learning() ? "Stop" : "Learn";
+    byId("save").disabled = !state.finished;
+    const maps = document.querySelector("#formats input[value=maps]");
+    maps.disabled = !state.source?.uv;
+    maps.parentElement.title = maps.disabled ? "needs a mesh with texture coordinates" : "height and normal map";
+    if (maps.disabled) maps.checked = false;
+    byId("command").textContent = state.command;
+    byId("notes").replaceChildren(...state.notes.map((note) => {
+      const item = document.createElement("li");
+      item.textContent = note;
+      return item;
+    }));
+    if (state.source) {
+      byId("name-source").textContent = byId("name-source").title = state.source.name;
+      byId("facts-source").textContent = `${state.source.vertices.toLocaleString()} vertices`;
+      byId("name-style").textContent = byId("name-style").title = state.style.name;
+      byId("facts-style").textContent = state.style.picture ? "a picture" : "a mesh";
+    }
+    places();
+  }
+
+  async function look(name) {
+    const version = state.looks[name];
+    if (version === undefined || shown[name] === version) return;
+    const content = new Uint8Array(await (await fetch(`look/${name}`)).arrayBuffer());
+    shown[name] = version;
+    if (name === "style") {
+      byId("picture-style").hidden = !state.style.picture;
+      byId("small-style").hidden = state.style.picture;
+      if (state.style.picture) byId("picture-style").src = URL.createObjectURL(new Blob([content], { type: "image/png" }));
+      else await show(byId("small-style"), content, [SURFACE]);
+    } else {
+      await show(byId(`view-${name}`), content, [SURFACE]);
+      if (name === "source") await show(byId("small-source"), content, [SURFACE]);
+      else byId("stage").dataset.shown = String(Number(byId("stage").dataset.shown || 0) + 1);
+    }
+  }
+
+  const trouble = obstacle();
+  if (trouble) complain(trouble);
+  else await startViewer();
+  while (true) {
+    try {
+      state = await ask(`state?since=${state ? state.version : -1}`);
+      if (gone) complain("");
+      gone = false;
+      update();
+      if (!trouble) for (const name of ["source", "style", "result"]) await look(name);
+      await new Promise((next) => setTimeout(next, 100));
+    } catch (error) {
+      gone = true;
+      complain(`The studio doesn't answer (${error.message}). Is it still running in the terminal?`);
+      await new Promise((next) => setTimeout(next, 2000));
+    }
+  }
+})();

@@ -1,0 +1,188 @@
+"""The studio without its page: settings, what is made of them, what is saved."""
+
+import time
+import xml.etree.ElementTree as ET
+import zipfile
+
+import numpy as np
+import pytest
+import trimesh
+
+import styleexp
+from styleexp.inputs import meshes, shapes
+from styleexp.studio.settings import Settings, safe_name
+from styleexp.studio.workbench import Remembering, Workbench
+from styleexp.system.errors import UserError
+
+QUICK = ("source.refine=none", "baseline.bank=600", "threads=1")
+
+
+def until(bench, condition, seconds=120):
+    """The first state that meets the condition."""
+    deadline, since = time.monotonic() + seconds, -1
+    while time.monotonic() < deadline:
+        state = bench.state(since, 1.0)
+        since = state["version"]
+        if condition(state):
+            return state
+    pytest.fail(f"after {seconds} s still: {state}")
+
+
+def done(state):
+    return state["finished"] and state["stage"] == "done"
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("given")
+    for name, detail in (("sphere", 1500), ("bubble", 3000)):
+        mesh = shapes.make(name, detail)
+        meshes.save_mesh(mesh, mesh.vertices, folder / f"{name}.ply")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def bench(files, tmp_path_factory):
+    settings = Settings(str(files / "sphere.ply"), str(files / "bubble.ply"), more=QUICK)
+    bench = Workbench(settings, tmp_path_factory.mktemp("out"))
+    bench.start()
+    until(bench, done)
+    return bench
+
+
+def saved_vertices(bench):
+    (path, _) = bench.save(["ply"])
+    return meshes.load_mesh(path).vertices, (path.parent / "command.txt").read_text()
+
+
+def test_what_is_saved_is_what_the_command_makes(bench, files):
+    given = (str(files / "sphere.ply"), str(files / "bubble.ply"))
+    bench.change({"strength": 0.5, "scale": 2.0, "mask": "height:0.5..1"})
+    state = until(bench, lambda s: done(s) and s["settings"]["scale"] == 2.0)
+    assert any("covers" in note for note in state["notes"])
+    vertices, command = saved_vertices(bench)
+    overrides = command.split()[3:]
+    assert set(overrides) == {"strength=0.5", "style.scale=2", "style.mask=height:0.5..1", *QUICK}
+    expected = styleexp.stylize(*given, *overrides)
+    assert np.array_equal(vertices, expected.vertices.astype(np.float32))
+    assert bench.settings.command().split() == command.split()
+
+
+def test_height_and_place_need_no_synthesis_and_direction_no_sampling(bench, monkeypatch):
+    bench.change({"mask": "", "scale": 1.0, "strength": 1.0})
+    until(bench, lambda s: done(s) and s["settings"]["strength"] == 1.0)
+    stages = []
+    tell = bench._tell
+    monkeypatch.setattr(
+        bench, "_tell", lambda stage=None, **f: (stages.append(stage), tell(stage, **f))
+    )
+    bench.change({"strength": 0.3, "mask": "slope:60"})
+    until(bench, lambda s: done(s) and s["settings"]["strength"] == 0.3)
+    assert not any(stage and "round" in stage for stage in stages)
+    bench.change({"rotation": 45.0})
+    until(bench, lambda s: done(s) and s["settings"]["rotation"] == 45.0)
+    assert any(stage and "round" in stage for stage in stages)
+
+
+def test_kept_samples_are_those_of_the_exemplar():
+    class Exemplar:
+        calls = 0
+
+        def sample(self, count, side, spacing, rng, any_way):
+            self.calls += 1
+            return rng.random(count)
+
+    given = Exemplar()
+    kept = Remembering(given)
+    first, again = np.random.default_rng(0), np.random.default_rng(0)
+    assert np.array_equal(kept.sample(3, 1, 1.0, first, True), kept.sample(3, 1, 1.0, again, True))
+    assert given.calls == 1
+    assert first.random() == again.random()
+    kept.sample(3, 1, 2.0, np.random.default_rng(0), True)
+    assert given.calls == 2
+
+
+def test_a_wrong_mask_is_said_and_the_next_settings_work(bench):
+    bench.change({"mask": "attribute:eyes"})
+    state = until(bench, lambda s: s["stage"] == "failed")
+    assert "has no such vertex attribute" in state["error"]
+    with pytest.raises(UserError, match="isn't finished"):
+        bench.save(["ply"])
+    bench.change({"mask": ""})
+    assert until(bench, done)["error"] == ""
+
+
+def test_prints_hold_the_same_surface(bench):
+    bench.change({"mask": ""})
+    until(bench, done)
+    paths = {path.suffix: path for path in bench.save(["ply", "stl", "3mf"])}
+    expected = meshes.load_mesh(paths[".ply"])
+    printed = trimesh.load(paths[".stl"])
+    assert printed.is_watertight
+    assert printed.volume == pytest.approx(
+        trimesh.Trimesh(expected.vertices, expected.faces).volume, rel=1e-5
+    )
+    with zipfile.ZipFile(paths[".3mf"]) as package:
+        assert "[Content_Types].xml" in package.namelist()
+        model = ET.fromstring(package.read("3D/3dmodel.model"))
+    core = "{http://schemas.microsoft.com/3dmanufacturing/core/2015/02}"
+    points = [[float(each.get(axis)) for axis in "xyz"] for each in model.iter(f"{core}vertex")]
+    corners = [
+        [int(each.get(f"v{k}")) for k in (1, 2, 3)] for each in model.iter(f"{core}triangle")
+    ]
+    assert model.get("unit") == "millimeter"
+    assert trimesh.Trimesh(points, corners).volume == pytest.approx(printed.volume, rel=1e-5)
+
+
+def test_maps_need_texture_coordinates(bench):
+    until(bench, done)
+    with pytest.raises(UserError, match="no texture coordinates"):
+        bench.save(["maps"])
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"strength": 9}, "from -2 to 2"),
+        ({"strength": True}, "must be a number"),
+        ({"scale": float("nan")}, "must be a number"),
+        ({"direction": "left"}, "is none of auto"),
+        ({"source": "a\nb"}, "must be a short text"),
+        ({"invert": 1}, "must be true or false"),
+        ({"more": ["hydra.run.dir=/"]}, "no setting 'more'"),
+        ({"hydra.run.dir": "/"}, "no setting"),
+    ],
+)
+def test_settings_that_are_refused(given, said):
+    with pytest.raises(UserError, match=said):
+        Settings().changed(given)
+
+
+@pytest.mark.parametrize(
+    ("given", "kept"),
+    [
+        ("head.obj", "head.obj"),
+        ("../../etc/passwd.obj", "passwd.obj"),
+        ("C:\\meshes\\head.obj", "head.obj"),
+        ("/etc/x.ply", "x.ply"),
+        ("-rf.obj", "rf.obj"),
+        ("a\x00b\n.png", "ab.png"),
+        ("李明 头.obj", "李明 头.obj"),
+    ],
+)
+def test_names_stay_in_their_folder(given, kept):
+    assert safe_name(given) == kept
+
+
+@pytest.mark.parametrize("given", ["", "..", "/", "...", "x" * 300 + ".obj"])
+def test_names_that_are_refused(given):
+    with pytest.raises(UserError, match="can't be used"):
+        safe_name(given)
+
+
+def test_files_that_are_refused(bench):
+    with pytest.raises(UserError, match="can't be read"):
+        bench.receive("source", "virus.exe", b"x")
+    with pytest.raises(UserError, match="no place"):
+        bench.receive("elsewhere", "a.obj", b"x")
+    assert not (bench.folder / "files" / "virus.exe").exists()
