@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from styleexp.inputs import meshes, shapes
-from tests.helpers.browser import browser, check_quiet, covered, pixels, wait
+from tests.helpers.browser import browser, covered, pixels, requests, wait
 
 QUICK = ("source.refine=none", "baseline.bank=600", "threads=1")
 EVIL = "<img src=x onerror=alert(1)>.obj"
@@ -124,7 +124,10 @@ def test_from_drop_to_saved_files(studio, given, tmp_path):
             page.find_element("css selector", f"#formats input[value='{kind}']").click()
         page.find_element("id", "save").click()
         wait(page, "document.getElementById('saved').dataset.count === '5'")
-        check_quiet(page)
+        assert [each for each in page.get_log("browser") if each["level"] == "SEVERE"] == []
+        asked = requests(page)
+        assert any(url.startswith(address) for url in asked)
+        assert [url for url in asked if not url.startswith((address, "blob:", "data:"))] == []
     names = {path.name for path in folder.glob("*/*") if path.parent.name != "files"}
     assert {"height.png", "normal.png", "command.txt"} < names
     assert {name.rpartition(".")[2] for name in names} == {"glb", "stl", "png", "txt"}
