@@ -341,11 +341,14 @@ def test_options_have_limits_of_their_own():
     class Options:
         kind: str | None = option(None, choices=("a", "b"))
         sizes: list[float] = option(factory=lambda: [1.0, 2.0], between=(0, 5))
+        ways: list[str] = option(factory=list, choices=("up", "down"))
         inner: Inner = option(factory=Inner)
 
     limits.check(Options())
+    limits.check(Options(ways=["down", "up"]))
     for options, message in (
         (Options(kind="c"), "unknown value for kind 'c'"),
+        (Options(ways=["up", "left"]), "unknown value for ways 'left'"),
         (Options(sizes=[1.0, 9.0]), r"sizes=\[1.0, 9.0\] is not allowed: give a value from 0 to 5"),
         (Options(sizes=[math.nan]), "sizes=nan is not allowed: give a finite number"),
         (Options(inner=Inner(0.0)), "inner.share=0.0 is not allowed: give a value above 0"),

@@ -23,6 +23,7 @@ import numpy as np
 
 from styleexp.api import configured
 from styleexp.config import build, sources
+from styleexp.config.checks import check
 from styleexp.experiments.reports import glb
 from styleexp.inputs import meshes
 from styleexp.inputs.style import Style
@@ -396,6 +397,7 @@ class _Cache:
     def subject(self, settings: Settings, more: tuple[str, ...], config: Any, load: Any) -> Subject:
         """The subject, measured anew only if source, style or scale differ."""
         wanted = config(more)
+        check(wanted)
         masks.check(wanted.style, load[0])
 
         def make() -> Subject:

@@ -47,8 +47,9 @@ def check(options: Any) -> None:
     """
     found = list(_values(options))
     for key, value, limits in found:
-        if "choices" in limits and value not in (None, *limits["choices"]):
-            raise unknown_name(f"value for {key}", str(value), map(str, limits["choices"]))
+        for each in value if isinstance(value, list) else [value]:
+            if "choices" in limits and each not in (None, *limits["choices"]):
+                raise unknown_name(f"value for {key}", str(each), map(str, limits["choices"]))
     for key, value, _ in found:
         for number in value if isinstance(value, list) else [value]:
             if isinstance(number, int | float) and not math.isfinite(number):
