@@ -12,6 +12,7 @@ import secrets
 import socket
 import webbrowser
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -158,5 +159,14 @@ def serve(settings: Settings, folder: Path, port: int, opens: bool) -> int:
             application(bench, token), log_level="warning", access_log=False, lifespan="off",
             timeout_graceful_shutdown=1,
         )  # fmt: skip
-        uvicorn.Server(options).run(sockets=[listening])
+        server = uvicorn.Server(options)
+        ends = server.handle_exit
+
+        def handle_exit(*signal: Any) -> None:
+            bench.close()  # else requests that wait for news would be waited for
+            ends(*signal)
+
+        server.handle_exit = handle_exit  # type: ignore[assignment]
+        with suppress(KeyboardInterrupt):
+            server.run(sockets=[listening])
     return 0

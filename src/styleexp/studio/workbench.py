@@ -92,7 +92,7 @@ class Workbench:
         self._stage, self._error = "starting", ""
         self._notes: list[str] = []
         self._made: Made | None = None
-        self._learn, self._stop = False, False
+        self._learn, self._stop, self._closed = False, False, False
         self._cache = _Cache()
         self._thread = threading.Thread(target=self._work, daemon=True, name="workbench")
 
@@ -128,12 +128,20 @@ class Workbench:
             self._learn, self._stop = False, True
             self._lock.notify_all()
 
+    def close(self) -> None:
+        """Answer everyone who waits."""
+        with self._lock:
+            self._closed = True
+            self._lock.notify_all()
+
     def state(self, since: int, wait: float) -> dict[str, Any]:
         """Everything that the page shows, once it differs from the version ``since``, or after
         ``wait`` seconds."""
         with self._lock:
             busy = self._stage not in ("done", "failed")
-            self._lock.wait_for(lambda: self._version != since, NEWS if busy else wait)
+            self._lock.wait_for(
+                lambda: self._version != since or self._closed, NEWS if busy else wait
+            )
             made = self._made
             return {
                 "version": self._version,
