@@ -13,7 +13,7 @@ import numpy as np
 from styleexp.experiments.ratings import verdict
 from styleexp.experiments.reports import charts, glb, html
 from styleexp.experiments.reports import shown as shows
-from styleexp.runs import reading
+from styleexp.runs import provenance, reading
 
 if TYPE_CHECKING:
     from styleexp.experiments.reports.shown import Shown
@@ -104,8 +104,14 @@ def build(run: Run, shown: Shown) -> str:
         style_picture=style_picture,
         heat=_heat(shown),
         curves=curves(run),
-        warnings=[*(run.record.get("notes") or ()), *run.problems, *shown.missing],
-        assets=_assets(run),
+        warnings=[
+            *(run.record.get("notes") or ()),
+            *provenance.resumptions(run.record),
+            *run.problems,
+            *shown.missing,
+        ],
+        inputs=_inputs(run),
+        made_with=provenance.made_with(run.record),
         still=html.picture(run.folder / "preview.png", STILL_PIXELS),
         meanings=MEANINGS,
         verdict=verdict(run.metrics),
@@ -192,8 +198,8 @@ def _heat(shown: Shown) -> dict[str, str] | None:
     }
 
 
-def _assets(run: Run) -> list[dict[str, str]]:
-    """Origin of source and style, with licence and author if known."""
+def _inputs(run: Run) -> list[dict[str, str]]:
+    """Origin of source and style, with licence and author if known, and of plugins."""
     from styleexp.inputs import assets
 
     rows = []
@@ -211,6 +217,18 @@ def _assets(run: Run) -> list[dict[str, str]]:
                 "name": str(run.config.get(f"{kind}.path") or row.get("name") or row.get("path")),
                 "sha256": row.get("sha256") or "–",
                 "origin": origin,
+            }
+        )
+    for each in run.record.get("plugins") or ():
+        package = " ".join(filter(None, [each.get("distribution"), each.get("version")]))
+        rows.append(
+            {
+                "kind": f"{each.get('kind')}, a plugin",
+                "name": str(each.get("name")),
+                "sha256": each.get("sha256") or "–",
+                "origin": ", ".join(
+                    filter(None, [package, each.get("file") or each.get("origin")])
+                ),
             }
         )
     return rows
