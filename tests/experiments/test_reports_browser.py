@@ -213,6 +213,28 @@ def test_sweep_page_opens_runs_sorts_and_shows_failures(runs, page):
     check_quiet(page)
 
 
+def test_compared_runs_turn_together_and_the_difference_is_coloured(runs, page):
+    from selenium.webdriver.common.keys import Keys
+
+    report("board/bubble", "board/noise", "--out", "compared.html", cwd=runs)
+    open_run(page, runs / "compared.html")
+    assert page.title == "torus: style bubble, noise"
+    plain = [pixels(page, f"#view-result-{k}") for k in (0, 1)]
+    for picture in plain:
+        assert covered(picture)[0] > 0.1
+    press(page, "heat")
+    first, second = (pixels(page, f"#view-result-{k}") for k in (0, 1))
+    assert np.abs(first - plain[0]).mean() < 1  # the others are compared with it
+    assert np.abs(second - plain[1]).mean() > 2
+    assert "in radii of the source" in page.find_element("id", "legend").text
+    before = orbit(page, "result-0")[0]
+    view = page.find_element("id", "view-result-1")
+    page.execute_script("arguments[0].shadowRoot.querySelector('.userInput').focus()", view)
+    page.switch_to.active_element.send_keys(Keys.ARROW_LEFT * 5)
+    wait(page, f"Math.abs(byId('view-result-0').getCameraOrbit().theta - {before}) > 0.2")
+    check_quiet(page)
+
+
 def keep_still(page):
     """As for people who ask for less motion: in software each frame of a turn takes long."""
     still = [{"name": "prefers-reduced-motion", "value": "reduce"}]

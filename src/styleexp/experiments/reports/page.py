@@ -16,7 +16,7 @@ from styleexp.experiments.reports import shown as shows
 from styleexp.runs import provenance, reading
 
 if TYPE_CHECKING:
-    from styleexp.experiments.reports.shown import Shown
+    from styleexp.experiments.reports.shown import Shape, Shown
     from styleexp.method.base import Result
     from styleexp.runs.reading import Run
 
@@ -87,12 +87,6 @@ def rewrite(folder: Path, tell: Callable[[str], Any] | None = None) -> Path:
 
 def build(run: Run, shown: Shown) -> str:
     """Render the page as HTML."""
-    style_picture = None
-    if isinstance(shown.style, np.ndarray):
-        from PIL import Image
-
-        pixels = (shown.style * 255).round().astype(np.uint8)
-        style_picture = html.data_uri(Image.fromarray(pixels), STYLE_PIXELS, "JPEG")
     return html.render(
         "run.html",
         ["viewers.js", "run.js"],
@@ -101,7 +95,7 @@ def build(run: Run, shown: Shown) -> str:
         panels=panels(run, shown),
         blocks={f"glb-{k}": html.packed(content) for k, content in shown.files().items()},
         viewer=html.viewer(),
-        style_picture=style_picture,
+        style_picture=style_picture(shown.style),
         heat=_heat(shown),
         curves=curves(run),
         warnings=[
@@ -119,6 +113,16 @@ def build(run: Run, shown: Shown) -> str:
         overridden={override.lstrip("+~").split("=")[0] for override in run.overrides},
         plain=html.plain,
     )
+
+
+def style_picture(style: Shape | np.ndarray | None) -> str | None:
+    """A style that is a picture, as a data URI; None for a mesh."""
+    if not isinstance(style, np.ndarray):
+        return None
+    from PIL import Image
+
+    pixels = (style * 255).round().astype(np.uint8)
+    return html.data_uri(Image.fromarray(pixels), STYLE_PIXELS, "JPEG")
 
 
 def facts(run: Run, shown: Shown) -> list[tuple[str, str]]:
@@ -188,9 +192,8 @@ def _heat(shown: Shown) -> dict[str, str] | None:
     """The heat map's legend."""
     if shown.displacement is None or shown.reach == 0:
         return None
-    stops = (glb.diverging(np.linspace(-1, 1, 9)) * 255).round().astype(int).tolist()
     return {
-        "gradient": ", ".join(f"rgb({r} {g} {b})" for r, g, b in stops),
+        "gradient": glb.gradient(),
         "reach": f"{shown.reach:.3g}",
         "share": f"{100 * shown.reach / shown.radius:.2g}",
         "outermost": f"{shown.displacement.max():.3g}",

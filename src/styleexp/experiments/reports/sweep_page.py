@@ -11,16 +11,13 @@ from typing import Any
 
 from styleexp.experiments.reports import charts, comparison, html, page
 from styleexp.experiments.reports.comparison import Comparison
+from styleexp.experiments.reports.differing import OMITTED, SEED, settings
 from styleexp.runs import finding
 from styleexp.runs.reading import Run
 from styleexp.runs.records import RunFolder
 from styleexp.system.errors import UserError
 
 NAME = "report.html"
-SEED = "optim.seed"
-"""Key of the seed; runs that differ only in it share a cell."""
-OMITTED = "not given"
-"""Axis value of a run without an override for it."""
 
 
 @dataclass(frozen=True)
@@ -167,12 +164,6 @@ def axes(runs: list[Run]) -> dict[str, list[str]]:
         if len(values) > 1:
             found[key] = sorted(values, key=float) if all(map(_is_number, values)) else values
     return found
-
-
-def settings(run: Run) -> dict[str, str]:
-    """A run's overrides by key, without Hydra's prefixes and without ``hydra.*`` keys."""
-    pairs = (override.lstrip("+~").partition("=") for override in run.overrides)
-    return {key: value for key, _, value in pairs if not key.startswith("hydra")}
 
 
 def headline(run: Run) -> tuple[str, float] | None:
