@@ -62,7 +62,7 @@ def report(given: list[str]) -> list[Path]:
 
 
 def _page(folder: Path, run_pages: bool) -> Path:
-    """Write the page of a run or of all runs below a folder."""
+    """Write the page of a run, of all runs below a folder, or of an experiment's newest sweep."""
     from styleexp.experiments.reports import page, sweep_page
     from styleexp.runs import finding
 
@@ -70,7 +70,14 @@ def _page(folder: Path, run_pages: bool) -> Path:
         return page.rewrite(
             folder, lambda note: print(f"styleexp-report: note: {note}", file=sys.stderr)
         )
-    return sweep_page.write(folder, run_pages)
+    sweeps = finding.sweeps_of_experiment(folder)
+    if len(sweeps) > 1:
+        print(
+            f"styleexp-report: note: '{folder}' has {len(sweeps)} sweeps; this is the newest, of "
+            f"{sweeps[-1].name} (give its folder for another)",
+            file=sys.stderr,
+        )
+    return sweep_page.write(sweeps[-1] if sweeps else folder, run_pages)
 
 
 def study(given: list[str]) -> list[Path]:
@@ -151,7 +158,8 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         nargs="+",
         metavar="FOLDER",
-        help="folder of a run, a sweep, or several sweeps; or several folders of runs, which are "
+        help="folder of a run, a sweep, or several sweeps, or of an experiment, whose newest sweep "
+        "is shown; or several folders of runs, which are "
         "compared with the first",
     )
     parser.add_argument(

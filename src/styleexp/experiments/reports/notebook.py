@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from styleexp.experiments.reports import differing, html, page, sweep_page
+from styleexp.experiments.reports import comparison, differing, html, page, sweep_page
 from styleexp.experiments.reports.collect import collect
 from styleexp.runs import finding, results
 from styleexp.system.errors import UserError
@@ -294,7 +294,7 @@ def latex(frame: pandas.DataFrame) -> str:
     def cell(value: Any) -> str:
         if isinstance(value, float | np.floating):
             return "--" if math.isnan(value) else f"{value:.4g}"
-        return "".join(LATEX.get(letter, letter) for letter in str(value))
+        return comparison.escaped(str(value))
 
     kinds = ["r" if frame[column].dtype.kind in "fi" else "l" for column in frame]
     lines = [r"\begin{tabular}{" + "".join(kinds) + "}", r"\toprule"]
@@ -303,13 +303,6 @@ def latex(frame: pandas.DataFrame) -> str:
     for row in frame.itertuples(index=False):
         lines.append(" & ".join(cell(value) for value in row) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
-
-
-LATEX = {letter: f"\\{letter}" for letter in "&%$#_{}"} | {
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-}
 
 
 def _order(column: pandas.Series) -> list[Any]:
