@@ -12,6 +12,8 @@ from styleexp.runs import identity, origins, provenance, reading, records, resul
 from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     import numpy as np
     import torch
 
@@ -59,8 +61,7 @@ def reproduce(folder: Path, out: Path | None = None) -> int:
     config = origins.restored(run.record, folder, "reproduce", print)
     _check_plugins(config, run)
     as_recorded(config, run.record)
-    apart = provenance.differences(run.record, _here(config, run))
-    tell_differences(run, apart)
+    tell_differences(run, _here(config, run))
     here = folder.absolute()
     new = out or claim.fresh(HOME / here.parent.name / here.name)
     code = execute.run(config, new, run.overrides, command=["styleexp", "reproduce", str(folder)])
@@ -92,23 +93,25 @@ def compare(old: Run, new: Run, config: Config) -> Compared:
     return Compared(_apart(first, second, config), metrics)
 
 
-def tell_differences(run: Run, apart: list[provenance.Difference]) -> None:
-    """Print what is reproduced, and what isn't as it was."""
+def tell_differences(run: Run, here: Mapping[str, Any]) -> None:
+    """Print what is reproduced, and what isn't as it was: ``here`` is this process's record."""
     took = f", {run.seconds:.0f} s then" if run.seconds is not None else ""
     print(f"reproducing {run.folder}: {run.title}{took}")
     for kind, asset in (run.record.get("assets") or {}).items():
         name, digest = asset.get("path") or asset.get("name"), asset.get("sha256")
-        told = f"sha256 {digest[: provenance.DIGITS]}, as then" if digest else "made by code"
+        told = f"sha256 {digest[: provenance.DIGITS]}, as then" if digest else "no file"
         print(f"{kind}: {name} ({told})")
-    if apart:
+    known, now = provenance.made_with(run.record), provenance.made_with(here)
+    if apart := provenance.differences(run.record, here):
         print("differs from then:")
         for each in apart:
             print(f"  {each.name}: {each.then} then, {each.now} now")
     else:
-        known = provenance.made_with(run.record)
         names = ("styleexp", "commit", "torch", "device", "threads")
-        print("nothing differs from then, of what is recorded: "
-              + ", ".join(f"{name} {known[name]}" for name in names if name in known))  # fmt: skip
+        shown = ", ".join(f"{name} {known[name]}" for name in names if name in known)
+        print(f"nothing differs from then, of what is recorded: {shown}")
+    if unknown := [name for name in now if name not in known]:
+        print(f"not recorded then: {', '.join(unknown)}")
 
 
 def tell_results(old: Run, new: Run, config: Config) -> int:
