@@ -33,12 +33,12 @@ API = {
                   "renderers.soft_raster.shading", "renderers.soft_raster.deferred",
                   "renderers.mitsuba_ad", "renderers.moderngl_deferred"),
     "Encoders": ("encoders", "encoders.base", "encoders.vgg", "encoders.fused", "encoders.clip", "inputs.weights"),
-    "Parts and plugins": ("plugins", "plugins.spec", "plugins.catalogue", "plugins.loggers", "testing", "testing.renderers", "testing.losses", "testing.fields", "testing.encoders", "testing.styles", "testing.methods", "system.options", "system.errors"),
-    "Runs, metrics, reports": ("runs.records", "runs.reading", "runs.finding", "runs.jobs", "runs.results", "runs.untrusted", "runs.identity", "runs.origins", "experiments.execute", "experiments.metrics", "experiments.metrics.style", "experiments.metrics.shape",
+    "Parts and plugins": ("plugins", "plugins.spec", "plugins.code", "plugins.catalogue", "plugins.loggers", "testing", "testing.renderers", "testing.losses", "testing.fields", "testing.encoders", "testing.styles", "testing.methods", "system.options", "system.errors"),
+    "Runs, metrics, reports": ("runs.records", "runs.reading", "runs.finding", "runs.jobs", "runs.results", "runs.untrusted", "runs.identity", "runs.origins", "runs.provenance", "experiments.execute", "experiments.reproduce", "experiments.metrics", "experiments.metrics.style", "experiments.metrics.shape",
                                "experiments.metrics.truth", "experiments.reports", "experiments.reports.collect",
-                               "experiments.reports.reliability", "experiments.reports.study_results", "experiments.sweeps.claim", "experiments.sweeps.plan", "experiments.sweeps.runner", "experiments.agreement", "method.gram_cache", "experiments.bench.render", "experiments.bench.step"),
+                               "experiments.reports.compare_page", "experiments.reports.reliability", "experiments.reports.study_results", "experiments.sweeps.claim", "experiments.sweeps.plan", "experiments.sweeps.runner", "experiments.agreement", "method.gram_cache", "experiments.bench.render", "experiments.bench.step"),
 }  # fmt: skip
-COMMANDS = ("styleexp-assets", "styleexp-bake", "styleexp-bench", "styleexp-metrics",
+COMMANDS = ("styleexp reproduce", "styleexp-assets", "styleexp-bake", "styleexp-bench", "styleexp-metrics",
             "styleexp-plugins", "styleexp-report", "styleexp-report study", "styleexp-studio", "styleexp-sweep")  # fmt: skip
 EXTERNAL = re.compile(
     r"""<(?:script|img|iframe|source|video|audio)\b[^>]*\bsrc=["']?(?:https?:)?//[^"'\s>]*"""
@@ -237,8 +237,8 @@ def commands():
     """What every command says of itself."""
     out = ["# Commands", "`styleexp` takes the keys of the [configuration](configuration.md).", ""]
     for command in COMMANDS:
-        name, *rest = command.split()
-        module = importlib.import_module(f"styleexp.cli.{name.removeprefix('styleexp-')}")
+        name, *rest = command.removeprefix("styleexp").lstrip("- ").split()
+        module = importlib.import_module(f"styleexp.cli.{name}")
         text = io.StringIO()
         with redirect_stdout(text), suppress(SystemExit):
             module.main([*rest, "--help"])

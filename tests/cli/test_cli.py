@@ -320,6 +320,8 @@ def test_several_values_are_a_sweep_and_a_failed_job_does_not_stop_the_rest(tmp_
     assert "none.obj" in done.stderr
     states = [json.loads((tmp_path / f"all/{n}/status.json").read_text()) for n in (0, 1)]
     assert [s["status"] for s in states] == ["failed", "done"]
+    assert done.stdout.rstrip().endswith("all/report.html")
+    assert "style.path none.obj, there.ply</title>" in (tmp_path / "all/report.html").read_text()
 
 
 def with_style(folder):

@@ -78,7 +78,7 @@ def test_pairs_are_the_same_in_all_else_and_failed_runs_stay_out(sweep):
     assert mean.pairs == 3
     assert mean.difference == pytest.approx((0.1 + 0.2 + 0.1) / 3)
     assert mean.p == pytest.approx(2 / 8)
-    assert by_method.best("style_distance") == "a"
+    assert by_method.best("style_distance") == {"a"}
 
 
 def test_tables_beside_the_page(sweep):
@@ -89,8 +89,9 @@ def test_tables_beside_the_page(sweep):
     row = next(r for r in rows if r["method"] == "b" and r["measure"] == "style_distance")
     assert (row["n"], row["unfinished"], row["pairs"]) == ("3", "1", "3")
     text = (sweep / "means-method.tex").read_text()
-    assert r"style\_distance $\downarrow$" in text
-    assert r"\textbf{0.35" in text
+    assert r"style\\ distance $\downarrow$" in text
+    assert r"$\mathbf{0.35 \pm 0.21}$" in text
+    assert r"b & 3 of 4 & $0.43 \pm 0.38$" in text
     assert text.count("{") == text.count("}")
 
 
@@ -105,4 +106,27 @@ def test_a_chart_leaves_failed_runs_out(sweep):
 
 def test_one_run_has_no_interval_and_no_rival():
     assert comparison.compare("method", []).rows == []
-    assert compare("method", []).best("match") is None
+    assert compare("method", []).best("match") == set()
+
+
+@pytest.mark.parametrize(
+    ("mean", "reach", "cell"),
+    [
+        (0.98765, 0.0123, r"0.988 \pm 0.012"),
+        (-36.92, 30.1, r"-37 \pm 30"),
+        (0.5, math.nan, "0.5"),
+        (1.23456e-7, 2e-9, r"(1.235 \pm 0.020)\times 10^{-7}"),
+        (0.5, 1e-9, r"0.5 \pm 1\times 10^{-9}"),
+        (1234.6, 321.0, r"1235 \pm 321"),
+        (4.6e7, 2e6, r"(4.60 \pm 0.20)\times 10^{7}"),
+        (0.0, 0.0, r"0 \pm 0"),
+    ],
+)
+def test_numbers_of_a_table_for_a_paper(mean, reach, cell):
+    assert comparison._cell(mean, reach) == cell
+
+
+def test_text_of_a_table_for_a_paper():
+    assert comparison.escaped("a_b & 5 % <~^\\|") == (
+        r"a\_b \& 5 \% \textless{}\textasciitilde{}\textasciicircum{}\textbackslash{}\textbar{}"
+    )

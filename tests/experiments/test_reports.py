@@ -371,7 +371,36 @@ def test_links_lead_to_folders_with_odd_names(tmp_path):
     assert 'href="a%23b%20%3F/0/report.html"' in text
 
 
+def test_titles_say_what_differs(tmp_path):
+    at = tmp_path / "layer_ablation" / "2026-01-31_12-00-00"
+    for number, (sigma, seed) in enumerate([(1, 0), (1, 1), (5, 0)]):
+        write_run(at / str(number), [f"field.sigma={sigma}", f"optim.seed={seed}"])
+    text = sweep_page.write(at).read_text()
+    told = "layer_ablation, 2026-01-31 12-00-00: field.sigma 1, 5; 2 seeds"
+    assert f"<title>{told}</title>" in text
+    assert 'data-text="0 done field.sigma=1 optim.seed=0 "' in text
+
+
 # ------------------------------------------------------------------------------------ command
+
+
+def test_an_experiments_folder_stands_for_its_newest_sweep(tmp_path, capsys):
+    folder = tmp_path / "layer_ablation"
+    names = ("2026-01-31_12-00-00", "2026-02-01_09-00-00", "2026-02-01_09-00-00_2", "other")
+    for name in names:
+        write_run(folder / name / "0", ["layers=low", "+experiment=layer_ablation"])
+        jobs = [["layers=low", "+experiment=layer_ablation"]]
+        (folder / name / "jobs.json").write_text(json.dumps({"jobs": jobs}))
+    found = finding.sweeps_of_experiment(folder)
+    assert [path.name for path in found] == list(names[:3])
+    assert main([str(folder)]) == 0
+    out, err = capsys.readouterr()
+    assert out.strip() == str(folder / names[2] / "report.html")
+    assert "has 3 sweeps; this is the newest, of 2026-02-01_09-00-00_2" in err
+    folder.rename(tmp_path / "multirun")  # not an experiment's: all that is in it
+    assert finding.sweeps_of_experiment(tmp_path / "multirun") == []
+    assert main([str(tmp_path / "multirun")]) == 0
+    assert capsys.readouterr().out.strip() == str(tmp_path / "multirun" / "report.html")
 
 
 def test_command_writes_the_page_and_prints_its_path(sweep, capsys):

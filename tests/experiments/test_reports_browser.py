@@ -213,6 +213,55 @@ def test_sweep_page_opens_runs_sorts_and_shows_failures(runs, page):
     check_quiet(page)
 
 
+def test_compared_runs_turn_together_and_the_difference_is_coloured(runs, page):
+    from selenium.webdriver.common.keys import Keys
+
+    report("board/bubble", "board/noise", "--out", "compared.html", cwd=runs)
+    open_run(page, runs / "compared.html")
+    assert page.title == "torus: style bubble, noise"
+    plain = [pixels(page, f"#view-result-{k}") for k in (0, 1)]
+    for picture in plain:
+        assert covered(picture)[0] > 0.1
+    press(page, "heat")
+    first, second = (pixels(page, f"#view-result-{k}") for k in (0, 1))
+    assert np.abs(first - plain[0]).mean() < 1  # the others are compared with it
+    assert np.abs(second - plain[1]).mean() > 2
+    assert "in radii of the source" in page.find_element("id", "legend").text
+    before = orbit(page, "result-0")[0]
+    view = page.find_element("id", "view-result-1")
+    page.execute_script("arguments[0].shadowRoot.querySelector('.userInput').focus()", view)
+    page.switch_to.active_element.send_keys(Keys.ARROW_LEFT * 5)
+    wait(page, f"Math.abs(byId('view-result-0').getCameraOrbit().theta - {before}) > 0.2")
+    check_quiet(page)
+
+
+def test_sweep_page_filters_rows_and_pictures_and_groups_rows(runs, page):
+    from selenium.webdriver.support.ui import Select
+
+    page.get((runs / "sweep" / "report.html").as_uri())
+
+    def seen(selector):
+        return [
+            each for each in page.find_elements("css selector", selector) if each.is_displayed()
+        ]
+
+    box = page.find_element("id", "filter")
+    box.send_keys("FAILED style=bubble")
+    assert len(seen("table.runs tr[data-text]")) == len(seen(".entry")) == 1
+    assert page.find_element("id", "filter-state").text == "1 of 4 runs"
+    assert len(seen("table.sheet tbody tr")) == 1  # stripe's row is empty
+    Select(page.find_element("css selector", "select.group")).select_by_visible_text("style")
+    assert [row.text for row in seen("table.runs tr.group")] == ["style=bubble"]
+    box.clear()
+    box.send_keys(" ")
+    assert [row.text for row in seen("table.runs tr.group")] == ["style=bubble", "style=stripe"]
+    page.find_element("xpath", "//table[contains(@class, 'runs')]//button[.='field.sigma']").click()
+    rows = [row.text.split()[0] for row in seen("table.runs tbody tr")]
+    assert rows[0] == "style=bubble"  # a group's name stays first
+    assert len(rows) == 6
+    check_quiet(page)
+
+
 def keep_still(page):
     """As for people who ask for less motion: in software each frame of a turn takes long."""
     still = [{"name": "prefers-reduced-motion", "value": "reduce"}]

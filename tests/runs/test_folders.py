@@ -124,7 +124,7 @@ def test_two_runs_of_one_second_have_folders_of_their_own(tmp_path):
 def test_a_folder_is_claimed_once_by_many(tmp_path):
     """Threads are enough here: a lock belongs to an open file, a folder is made once."""
     with ThreadPoolExecutor(8) as pool:
-        made = list(pool.map(lambda _: claim._fresh(tmp_path / "a"), range(24)))
+        made = list(pool.map(lambda _: claim.fresh(tmp_path / "a"), range(24)))
     assert len(set(made)) == 24
     assert tmp_path / "a" in made
     for folder in made:

@@ -24,6 +24,7 @@ Put the local geometry of STYLE, a mesh or a picture, onto the mesh SOURCE. Both
   styleexp my.obj bark.jpg strength=0.5   a picture as style, at half the height
   styleexp my.obj her.ply method=robust   learned from renders, as in the paper: slower
   styleexp resume=FOLDER                  continue a stopped run
+  styleexp reproduce FOLDER               make a finished run again, and compare
 
 styleexp --help lists all keys and choices, and styleexp-assets list all names.
 """
@@ -67,6 +68,10 @@ def _command(given: list[str]) -> None:
 
         print(f"styleexp {__version__}")
         return
+    if given[0] == "reproduce":
+        from styleexp.cli import reproduce
+
+        sys.exit(reproduce.main(given[1:]))
     resume = [a for a in given if a.startswith("resume=")]
     if len(resume) > 1:
         raise UserError("resume= continues a single run: give it once.")

@@ -10,8 +10,8 @@ from pathlib import Path
 from styleexp.system.errors import UserError
 
 DESCRIPTION = """\
-Write one self-contained HTML page about a run, or about all runs below a folder, and print its
-path. For the user study, see 'styleexp-report study --help'."""
+Write one self-contained HTML page about a run, about all runs below a folder, or about several runs
+side by side, and print its path. For the user study, see 'styleexp-report study --help'."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -33,30 +33,51 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def report(given: list[str]) -> list[Path]:
     """Write the requested pages; return their paths."""
-    options = _parser().parse_args(given)
-    if not options.folder.is_dir():
-        raise UserError(f"there is no folder '{options.folder}': give a run's or a sweep's folder.")
-    if options.notebooks is not None:
+    options = _parser().parse_intermixed_args(given)
+    for folder in options.folders:
+        if not folder.is_dir():
+            raise UserError(f"there is no folder '{folder}': give a run's or a sweep's folder.")
+    if len(options.folders) > 1:
+        if options.notebooks is not None:
+            raise UserError("--notebooks takes a single folder.")
+        from styleexp.experiments.reports import compare_page
+
+        written = compare_page.write(options.folders, options.out)
+    elif options.out is not None:
+        raise UserError("--out is for the page of several runs: the others lie in their folder.")
+    elif options.notebooks is not None:
         from styleexp.experiments.reports import notebooks
 
-        pages, left_out = notebooks.execute(options.folder, options.notebooks)
+        pages, left_out = notebooks.execute(options.folders[0], options.notebooks)
         for note in left_out:
             print(f"styleexp-report: {note}", file=sys.stderr)
         return pages
-    from styleexp.experiments.reports import page, sweep_page
-    from styleexp.runs import finding
-
-    if finding.is_run(options.folder):
-        written = page.rewrite(
-            options.folder, lambda note: print(f"styleexp-report: note: {note}", file=sys.stderr)
-        )
     else:
-        written = sweep_page.write(options.folder, not options.no_run_pages)
+        written = _page(options.folders[0], not options.no_run_pages)
     if options.open:
         import webbrowser
 
         webbrowser.open(written.resolve().as_uri())
     return [written]
+
+
+def _page(folder: Path, run_pages: bool) -> Path:
+    """Write the page of a run, of all runs below a folder, or of an experiment's newest sweep."""
+    from styleexp.experiments.reports import page, sweep_page
+    from styleexp.runs import finding
+
+    if finding.is_run(folder):
+        return page.rewrite(
+            folder, lambda note: print(f"styleexp-report: note: {note}", file=sys.stderr)
+        )
+    sweeps = finding.sweeps_of_experiment(folder)
+    if len(sweeps) > 1:
+        print(
+            f"styleexp-report: note: '{folder}' has {len(sweeps)} sweeps; this is the newest, of "
+            f"{sweeps[-1].name} (give its folder for another)",
+            file=sys.stderr,
+        )
+    return sweep_page.write(sweeps[-1] if sweeps else folder, run_pages)
 
 
 def study(given: list[str]) -> list[Path]:
@@ -133,7 +154,20 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "folder", type=Path, metavar="FOLDER", help="folder of a run, a sweep, or several"
+        "folders",
+        type=Path,
+        nargs="+",
+        metavar="FOLDER",
+        help="folder of a run, a sweep, or several sweeps, or of an experiment, whose newest sweep "
+        "is shown; or several folders of runs, which are "
+        "compared with the first",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="file for the page of several runs (default: compare-….html in the folder that they "
+        "have in common)",
     )
     parser.add_argument(
         "--notebooks",

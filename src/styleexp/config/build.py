@@ -71,8 +71,8 @@ def separates(config: Config) -> bool:
 
 
 def cache_of(config: Config, encoder: Any) -> Cache:
-    """Cache of the style's statistics. Those that involve plugins, whose code can't be hashed, are
-    never cached."""
+    """Cache of the style's statistics. Those that involve plugins, whose code may depend on
+    more than its own files, are never cached."""
     parts = (("renderer", config.renderer), ("encoder", config.encoder), ("loss", config.loss))
     own = all(plugins.find(kind, part.name).origin == plugins.OWN for kind, part in parts)
     if not own or config.loss.name != "gram":

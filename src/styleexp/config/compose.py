@@ -238,6 +238,7 @@ ${hydra.help.header}
   styleexp my.obj her.ply method=robust profile=fast
   styleexp method=paper encoder=vgg19 field.sigma=5 source=critter style=stripe
   styleexp resume=outputs/spot-bubble/2026-01-31_12-00-00
+  styleexp reproduce outputs/spot-bubble/2026-01-31_12-00-00
 
 Choices (group=option):
 $APP_CONFIG_GROUPS

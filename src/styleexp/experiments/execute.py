@@ -38,11 +38,19 @@ INTERRUPTED = 130
 # ------------------------------------------------------------------- whether and how a run starts
 
 
-def run(config: Config, folder: Path, overrides: list[str], again: bool = True) -> int:
-    """Stylise and write everything into ``folder``; return the exit code.
+def run(
+    config: Config,
+    folder: Path,
+    overrides: list[str],
+    again: bool = True,
+    command: list[str] | None = None,
+) -> int:
+    """Stylise and write everything into ``folder``; return the exit code. ``command`` is recorded;
+    by default it is ``styleexp`` with the overrides.
 
     Without ``again``, as in a sweep, a finished run isn't repeated, and a different run in the
-    folder is an error instead of being replaced, unless it failed.
+    folder is an error instead of being replaced, unless it failed, or differs only in the code of
+    its plugins.
     """
     with _alone(folder):
         if not again:
@@ -52,20 +60,26 @@ def run(config: Config, folder: Path, overrides: list[str], again: bool = True) 
                 print(f"already done: {folder}")
                 return 0
             if found.status == "other" and found.last_status != "failed":
-                raise UserError(
-                    f"'{folder}' doesn't belong to this job: {found.reason}; choose another "
-                    "folder with hydra.sweep.dir=FOLDER, or remove it."
-                )
-        return begin(config, folder, overrides)
+                edited = identity.edited_since(config, overrides, reading.read(folder).record)
+                if not edited:
+                    raise UserError(
+                        f"'{folder}' doesn't belong to this job: {found.reason}; choose another "
+                        "folder with hydra.sweep.dir=FOLDER, or remove it."
+                    )
+                told = " and ".join(edited)
+                print(f"note: the run in '{folder}' was of other code of {told}: running it again")
+        return begin(config, folder, overrides, command)
 
 
-def begin(config: Config, folder: Path, overrides: list[str]) -> int:
+def begin(
+    config: Config, folder: Path, overrides: list[str], command: list[str] | None = None
+) -> int:
     """Stylise into a folder whose lock is held; return the exit code.
 
     If the folder holds the same run, unfinished, it is resumed. So a job that a cluster requeues
     continues.
     """
-    record = records.describe(config, overrides, ["styleexp", *overrides])
+    record = records.describe(config, overrides, command or ["styleexp", *overrides])
     record |= origins.noted(config, (config.encoder.name, _judge_name(config)))
     run_folder = records.RunFolder(folder)
     unfinished = run_folder.unfinished(record)
@@ -81,8 +95,6 @@ def resume(folder: Path) -> int:
     """Resume an interrupted run from its checkpoint; return the exit code."""
     record = reading.recorded(folder, "resume").record
     config = origins.restored(record, folder, "resume", print)
-    if changed := records.changed_versions(record):
-        print(f"note: the run was started with {changed}: results may differ slightly")
     with _alone(folder):
         return _guarded(config, records.RunFolder(folder), record, resumed=True)
 
@@ -104,6 +116,11 @@ def _guarded(
     config: Config, folder: records.RunFolder, record: dict[str, Any], resumed: bool
 ) -> int:
     """Execute the run, and write its final status in any case; return the exit code."""
+    if resumed:
+        record, apart = records.resumed(record, config)
+        if apart:
+            told = ", ".join(map(str, apart))
+            print(f"note: the run was started with {told}: results may differ")
     atomic.sweep(folder.path)
     # Replace a finished run only once the new one can start: a typo must not cost a result.
     replaces = not resumed and reading.read(folder.path).last_status == "done"

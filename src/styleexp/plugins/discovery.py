@@ -26,13 +26,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cache, partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from styleexp import __version__
 from styleexp.encoders.options import EncoderConfig
 from styleexp.inputs import assets
 from styleexp.method.options import FieldConfig, LossConfig, StyleConfig
-from styleexp.plugins import catalogue
+from styleexp.plugins import catalogue, code
 from styleexp.plugins.spec import Spec
 from styleexp.system.errors import UserError, unknown_name
 from styleexp.system.options import check
@@ -84,6 +85,8 @@ class Choice:
     error: BaseException | None = field(default=None, compare=False, repr=False)
     ceded: bool = False
     """Refused because a built-in part or an asset has the same name."""
+    module: str | None = None
+    """The module that a plugin's spec was loaded from."""
 
     @property
     def spec(self) -> Spec:
@@ -93,6 +96,15 @@ class Choice:
                 self.error
             )
         return self.loaded
+
+    @property
+    def sha256(self) -> str | None:
+        """Hash of a plugin's code, see `code.of_modules`: of the module of its entry, and of that
+        which defines its factory. None if it has no file."""
+        modules = {self.module, getattr(self.spec.factory, "__module__", None)}
+        return code.of_modules(
+            frozenset(name for name in modules if name and name.split(".")[0] != OWN)
+        )
 
     @property
     def reason(self) -> str | None:
@@ -140,14 +152,31 @@ def warn_of_rivals(kind: str, name: str | None) -> None:
 
 
 def used(config: Any) -> list[dict[str, str | None]]:
-    """The plugins that a configuration uses, for a run's record."""
+    """The plugins that a configuration uses, for a run's record: ``kind``, ``name``, ``origin``,
+    ``distribution`` and ``version`` (None for those without a package), ``file`` of the spec's
+    module, and the ``sha256`` of its code (None if it has no file), see `Choice.sha256`."""
+
+    judge = getattr(getattr(config, "metrics", None), "judge", None)
 
     def named(kind: str) -> Iterable[str | None]:
         part = getattr(config, kind, None)
-        return part if isinstance(part, Mapping) else (getattr(part, "name", None),)
+        if isinstance(part, Mapping):
+            return part
+        return (getattr(part, "name", None), judge if kind == "encoder" else None)
+
+    def told(path: Path | None) -> str | None:
+        return str(path) if path else None
 
     return [
-        {"kind": c.kind, "name": c.name, "origin": c.origin, "version": c.version}
+        {
+            "kind": c.kind,
+            "name": c.name,
+            "origin": c.origin,
+            "distribution": c.distribution,
+            "version": c.version,
+            "file": told(code.file_of(c.module or "")),
+            "sha256": c.sha256,
+        }
         for c in everything()
         if c.origin != OWN and not c.fault and c.name in named(c.kind)
     ]
@@ -256,7 +285,10 @@ def _installed() -> Iterator[Choice]:
             origin = f"{name} ({point.value})"
             kinds = [kind for kind, about in KINDS.items() if about.group == point.group]
             if kinds:
-                yield _load(kinds[0], point.name, origin, version, name, point.load)
+                known = Choice(
+                    kinds[0], point.name, origin, version, name, module=_module(point.value)
+                )
+                yield _load(known, point.name, point.load)
             else:
                 fault = str(unknown_name("group", point.group, (k.group for k in KINDS.values())))
                 yield Choice(
@@ -276,10 +308,16 @@ def _named_by(variable: str) -> Iterator[Choice]:
             fault = f"'{item}' is not KIND=MODULE:SPEC with KIND one of {', '.join(KINDS)}"
             choice = Choice(kind if kind in KINDS else "?", item, origin, fault=fault)
         else:
-            choice = _load(kind, None, origin, None, None, partial(_attribute, module, attribute))
+            known = Choice(kind, origin, origin, module=module)
+            choice = _load(known, None, partial(_attribute, module, attribute))
         if choice.fault:
             warnings.warn(f"{VARIABLE}: {choice.fault}.", stacklevel=2)
         yield choice
+
+
+def _module(value: str) -> str:
+    """The module of an entry point, ``module:attribute [extras]``."""
+    return re.split(r"[:\s\[]", value.strip())[0]
 
 
 def _attribute(module: str, path: str) -> object:
@@ -289,24 +327,17 @@ def _attribute(module: str, path: str) -> object:
     return found
 
 
-def _load(
-    kind: str,
-    name: str | None,
-    origin: str,
-    version: str | None,
-    distribution: str | None,
-    load: Callable[[], object],
-) -> Choice:
-    """Load and check a spec; with ``name`` None, use the spec's own name."""
-    choice = Choice(kind, name or origin, origin, version, distribution)
+def _load(choice: Choice, name: str | None, load: Callable[[], object]) -> Choice:
+    """Load and check a choice's spec; with ``name`` None, use the spec's own name."""
     try:
         with redirect_stdout(sys.stderr):  # keep its output out of --json
             spec = load()
-            fault = _fault(kind, name, spec)
+            fault = _fault(choice.kind, name, spec)
     except (Exception, SystemExit) as error:
-        return replace(choice, fault=f"{origin} can't be loaded: {_one_line(error)}", error=error)
+        fault = f"{choice.origin} can't be loaded: {_one_line(error)}"
+        return replace(choice, fault=fault, error=error)
     if fault:
-        return replace(choice, fault=f"{origin} {fault}")
+        return replace(choice, fault=f"{choice.origin} {fault}")
     assert isinstance(spec, Spec)
     return replace(choice, name=spec.name, loaded=spec)
 

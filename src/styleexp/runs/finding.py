@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,8 @@ from styleexp.runs.reading import Run
 
 HYDRAS = ".hydra/overrides.yaml"
 """File that Hydra writes before the run has a record."""
+DATED = re.compile(r"(\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d)(?:_(\d+))?")
+"""Name of a folder that is named by the time, and which of that second's it is."""
 
 
 def find(folder: Path) -> list[Run]:
@@ -36,6 +39,32 @@ def folders(folder: Path) -> Iterator[Path]:
         elif (path / HYDRAS).is_file():
             yield path
         below[:] = sorted(name for name in below if not name.startswith("."))
+
+
+def sweeps_of_experiment(folder: Path) -> list[Path]:
+    """The sweeps of the experiment that ``folder`` is named after, oldest first.
+
+    ``styleexp +experiment=NAME`` puts them into ``outputs/NAME``, named by the time. Empty for any
+    other folder.
+    """
+    name = folder.resolve().name
+    dated = [(DATED.fullmatch(path.name), path) for path in folder.iterdir() if path.is_dir()]
+    found = [
+        (match[1], int(match[2] or 1), path)
+        for match, path in dated
+        if match and _experiment(path) == name
+    ]
+    return [path for *_, path in sorted(found)]
+
+
+def _experiment(sweep: Path) -> str | None:
+    """The experiment of a sweep, as its jobs' overrides name it."""
+    for overrides in (jobs.listed(sweep) or {}).get("jobs", ())[:1]:
+        for each in overrides:
+            key, _, value = each.lstrip("+").partition("=")
+            if key == "experiment":
+                return str(value)
+    return None
 
 
 def is_run(folder: Path) -> bool:

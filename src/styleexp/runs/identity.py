@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
@@ -20,19 +20,73 @@ if TYPE_CHECKING:
 
 ABSENT = "not found"
 """Placeholder for the sha256 of a missing file."""
+ASIDE = ("threads", "debug", "logger", "report", "formats")
+"""Keys that don't affect a result."""
 
 
 def essence(config: Mapping[str, Any]) -> Any:
     """A run's configuration as plain JSON, without keys that don't affect the result."""
-    aside = ("threads", "debug", "logger", "report", "formats")
-    kept = {key: value for key, value in config.items() if key not in aside}
+    kept = {key: value for key, value in config.items() if key not in ASIDE}
     return json.loads(json.dumps(kept, default=str))
 
 
 def job_key(config: Config) -> str:
     """Hash of everything that determines a run's result: its resolved configuration, this package's
-    version, and the content of its source and style files."""
+    version, the content of its source and style files, and the code of its plugins.
+
+    Runs of built-in parts alone have the keys that they had before the last was part of it.
+    """
     from styleexp import __version__
+
+    return _hash(asdict(config), _files(config), __version__, plugin_code(config))
+
+
+def plugin_code(config: Config) -> dict[str, str | None]:
+    """Hash of the code of each plugin that a run's result depends on, by ``kind=name``; the
+    plugin's version if its code can't be hashed."""
+    from styleexp import plugins
+
+    return _by_name(plugins.used(config))
+
+
+def edited(config: Config, record: Mapping[str, Any]) -> list[str]:
+    """The plugins of a configuration, as ``kind=name``, whose code is not that of a recorded run,
+    or for which the record doesn't tell."""
+    theirs = record.get("plugins")
+    before = _by_name(theirs if isinstance(theirs, list) else ())
+    return [name for name, code in plugin_code(config).items() if before.get(name) != code]
+
+
+def edited_since(config: Config, overrides: Sequence[str], record: Mapping[str, Any]) -> list[str]:
+    """Like `edited`, but empty unless the recorded run had the same overrides and is this
+    configuration's in all but these plugins and their options, whose defaults an edit may change.
+    """
+    from styleexp import __version__
+
+    names = edited(config, record)
+    kinds = {name.partition("=")[0] for name in names}
+
+    def rest(of: Mapping[str, Any]) -> dict[str, Any]:
+        return {key: value for key, value in of.items() if key not in kinds}
+
+    try:
+        files = {kind: asset["sha256"] for kind, asset in record["assets"].items()}
+        theirs = _hash(rest(record["config"]), files, record["versions"]["styleexp"])
+    except (KeyError, TypeError, AttributeError):
+        return []
+    ours = _hash(rest(asdict(config)), _files(config), __version__)
+    return names if theirs == ours and record.get("overrides") == list(overrides) else []
+
+
+def _by_name(used: Iterable[Mapping[str, Any]]) -> dict[str, str | None]:
+    return {
+        f"{each.get('kind')}={each.get('name')}": each.get("sha256") or each.get("version")
+        for each in used
+        if each.get("kind") not in ASIDE
+    }
+
+
+def _files(config: Config) -> dict[str, str | None]:
     from styleexp.config import sources
     from styleexp.system.errors import UserError
 
@@ -43,7 +97,7 @@ def job_key(config: Config) -> str:
             files[kind] = sha256(path) if path else None
         except UserError:  # the run reports it
             files[kind] = ABSENT
-    return _hash(asdict(config), files, __version__)
+    return files
 
 
 def of(record: Mapping[str, Any]) -> str | None:
@@ -70,12 +124,19 @@ def not_of(key: str | None, overrides: Sequence[str], record: Mapping[str, Any])
         return None
     difference = shlex.join(["styleexp", *theirs])
     if theirs == list(overrides):
-        difference = "the same overrides with other files or another version"
+        difference = "the same overrides with other files, plugins or another version"
     return f"the folder holds another run ({difference})"
 
 
-def _hash(config: Mapping[str, Any], files: Mapping[str, str | None], version: str | None) -> str:
+def _hash(
+    config: Mapping[str, Any],
+    files: Mapping[str, str | None],
+    version: str | None,
+    code: Mapping[str, str | None] | None = None,
+) -> str:
     content = {"config": essence(config), "files": files, "by": version}
+    if code:
+        content["plugins"] = code
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 

@@ -19,12 +19,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from styleexp import plugins
-from styleexp.runs import identity, reading
+from styleexp.plugins import code
+from styleexp.runs import identity, provenance, reading
 from styleexp.runs.schema import SCHEMA
 from styleexp.system import atomic, digests
 
 if TYPE_CHECKING:
     from styleexp.method.base import State, Step
+    from styleexp.runs.provenance import Difference
 
 FILES = (
     "status.json",
@@ -57,8 +59,12 @@ PACKAGES = (
     "hydra-core",
     "omegaconf",
     "safetensors",
+    "scipy",
+    "gpytoolbox",
+    "pillow",
     "mitsuba",
 )
+"""Packages whose versions are recorded."""
 
 
 @dataclass
@@ -247,7 +253,16 @@ def describe(config: Any, overrides: list[str], command: list[str]) -> dict[str,
         "command": command,
         "overrides": overrides,
         "config": asdict(config),
+        **environment(config),
+    }
+
+
+def environment(config: Any) -> dict[str, Any]:
+    """What a run is made with, for its record: ``versions`` of packages, ``code`` of this package
+    (`plugins.code.own`), ``plugins`` (`plugins.used`), and the ``platform``."""
+    return {
         "versions": {"python": platform.python_version(), **_versions()},
+        "code": code.own(),
         "plugins": plugins.used(config),
         "platform": {"system": platform.platform(), "machine": platform.machine()},
     }
@@ -263,12 +278,16 @@ def _versions() -> dict[str, str | None]:
     return found
 
 
-def changed_versions(record: Mapping[str, Any]) -> str:
-    """Packages whose versions differ from those the run was started with; empty if none."""
-    here = {"python": platform.python_version(), **_versions()}
-    then = record.get("versions") or {}
-    changed = [(name, old) for name, old in then.items() if name in here and old != here[name]]
-    return ", ".join(f"{name} {old} (now {here[name]})" for name, old in changed)
+def resumed(record: Mapping[str, Any], config: Any) -> tuple[dict[str, Any], list[Difference]]:
+    """The record of a run that goes on, and what it is now made with that it wasn't before.
+
+    Each time is kept under ``resumed``, with what differs from the run's beginning.
+    """
+    apart = provenance.differences(record, environment(config))
+    if not apart:
+        return dict(record), apart
+    told = {"time": now(), "differs": {each.name: [each.then, each.now] for each in apart}}
+    return {**record, "resumed": [*(record.get("resumed") or ()), told]}, apart
 
 
 def now() -> str:

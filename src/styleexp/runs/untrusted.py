@@ -121,14 +121,35 @@ def _is_assets(value: Any) -> bool:
     )
 
 
+def _is_plugins(value: Any) -> bool:
+    return isinstance(value, list) and all(
+        isinstance(each, dict) and all(isinstance(text, str | None) for text in each.values())
+        for each in value
+    )
+
+
+def _is_resumptions(value: Any) -> bool:
+    return isinstance(value, list) and all(
+        isinstance(each, dict)
+        and isinstance(each.get("time"), str)
+        and isinstance(each.get("differs"), dict)
+        and all(is_texts(pair) and len(pair) == 2 for pair in each["differs"].values())
+        for each in value
+    )
+
+
 SECTIONS: dict[str, Callable[[Any], bool]] = {
     "config": _is_mapping,
     "overrides": is_texts,
     "versions": _is_mapping,
+    "code": _is_mapping,
+    "plugins": _is_plugins,
+    "resumed": _is_resumptions,
     "platform": _is_mapping,
     "chosen": _is_mapping,
     "notes": is_texts,
     "assets": _is_assets,
+    "weights": _is_assets,
 }
 """Checks of a record's sections, each of which may also be missing."""
 

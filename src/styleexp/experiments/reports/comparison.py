@@ -35,8 +35,13 @@ BETTER = {
 """Measures shown in tables: 1 if larger is better, -1 if smaller is."""
 EXACT = 14
 """Number of differences up to which all sign changes are tried; above, 20,000 random ones."""
+MOST_DIGITS = 5
+"""Most digits after the point in a LaTeX table."""
+PLAIN = range(-3, 5)
+"""Powers of ten that a LaTeX table shows without an exponent."""
+INTERVAL = "Mean and 95 % confidence interval (Student's t) over n finished runs."
 CAPTION = (
-    "Mean and 95 % confidence interval (Student's t) over n finished runs. p: that the difference "
+    f"{INTERVAL} p: that the difference "
     "from the first row, on the same pairs and seeds, is chance; two-sided permutation of its "
     "signs, corrected over the column's rows (Holm). Seeds of one pair aren't independent, so p is "
     "too small where few pairs have many seeds."
@@ -77,11 +82,13 @@ class Comparison:
     measures: list[str]
     rows: list[Row]
 
-    def best(self, measure: str) -> str | None:
-        """The value with the best mean."""
+    def best(self, measure: str) -> set[str]:
+        """The values with the best mean; none if all means are equal."""
         means = {row.value: row.means[measure].mean for row in self.rows if measure in row.means}
-        sign = BETTER[measure]
-        return max(means, key=lambda value: sign * means[value]) if len(means) > 1 else None
+        if len(set(means.values())) < 2:
+            return set()
+        most = max if BETTER[measure] > 0 else min
+        return {value for value, mean in means.items() if mean == most(means.values())}
 
 
 def compare(key: str, runs: Sequence[tuple[str, tuple[str, ...], Run]]) -> Comparison:
@@ -185,26 +192,69 @@ def write_csv(comparison: Comparison, path: Path) -> None:
 
 
 def latex(comparison: Comparison) -> str:
-    """A table for booktabs, the best mean of each measure in bold."""
+    """A table for booktabs: a row per value, the best mean of each measure in bold. Measures with
+    the same mean in all of several rows are only named in a comment."""
     arrows = {1: r"$\uparrow$", -1: r"$\downarrow$"}
-    head = [_tex(comparison.key), "$n$"]
-    head += [f"{_tex(name)} {arrows[BETTER[name]]}" for name in comparison.measures]
-    lines = [rf"\begin{{tabular}}{{lr{'r' * len(comparison.measures)}}}", r"\toprule"]
+    head = [escaped(comparison.key), "$n$"]
+    shown = [name for name in comparison.measures if not _is_same(comparison, name)]
+    head += [_head(name, arrows[BETTER[name]]) for name in shown]
+    lines = ["% \\usepackage{booktabs}", f"% {INTERVAL}"]
+    if same := [name for name in comparison.measures if name not in shown]:
+        lines.append(f"% The same in all rows: {', '.join(same)}.")
+    lines += [rf"\begin{{tabular}}{{@{{}}lr{'r' * len(shown)}@{{}}}}", r"\toprule"]
     lines += [" & ".join(head) + r" \\", r"\midrule"]
     for row in comparison.rows:
-        cells = [_tex(row.value), str(row.done)]
-        for name in comparison.measures:
+        total = row.done + row.unfinished
+        cells = [
+            escaped(row.value),
+            str(row.done) if row.done == total else f"{row.done} of {total}",
+        ]
+        for name in shown:
             mean = row.means.get(name)
-            cell = "--" if mean is None else f"{mean.mean:.3g}"
-            if mean is not None and not math.isnan(mean.reach):
-                cell += rf" $\pm$ {mean.reach:.2g}"
-            bold = mean is not None and comparison.best(name) == row.value
-            cells.append(rf"\textbf{{{cell}}}" if bold else cell)
+            cell = "--" if mean is None else _cell(mean.mean, mean.reach)
+            best = row.value in comparison.best(name)
+            cells.append(rf"$\mathbf{{{cell}}}$" if best else f"${cell}$" if mean else cell)
         lines.append(" & ".join(cells) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
 
 
-def _tex(text: str) -> str:
+def _is_same(comparison: Comparison, measure: str) -> bool:
+    means = [row.means[measure].mean for row in comparison.rows if measure in row.means]
+    return 1 < len(means) == len(comparison.rows) and len(set(means)) == 1
+
+
+def _head(name: str, arrow: str) -> str:
+    """A measure's name on up to two lines, to keep its column narrow."""
+    first, _, rest = name.partition("_")
+    if not rest:
+        return f"{escaped(first)} {arrow}"
+    words = escaped(rest.replace("_", " ").replace("iou", "IoU"))
+    return rf"\begin{{tabular}}[b]{{@{{}}r@{{}}}}{escaped(first)}\\ {words} {arrow}\end{{tabular}}"
+
+
+def _cell(mean: float, reach: float) -> str:
+    """A mean and half its interval in math mode, to two significant digits of the latter."""
+    if math.isnan(reach):
+        return _number(mean)
+    if reach == 0:
+        return rf"{_number(mean)} \pm 0"
+    power = math.floor(math.log10(max(abs(mean), reach)))
+    power = 0 if power in PLAIN else power
+    digits = max(0, 1 - math.floor(math.log10(reach)) + power)
+    if digits > MOST_DIGITS:
+        return rf"{_number(mean)} \pm {_number(reach)}"
+    text = rf"{mean / 10.0**power:.{digits}f} \pm {reach / 10.0**power:.{digits}f}"
+    return rf"({text})\times 10^{{{power}}}" if power else text
+
+
+def _number(value: float) -> str:
+    """A number with three digits in math mode."""
+    text, _, exponent = f"{value:.3g}".partition("e")
+    return rf"{text}\times 10^{{{int(exponent)}}}" if exponent else text
+
+
+def escaped(text: str) -> str:
     """Text with LaTeX's special characters escaped."""
-    special = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    special = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
+               "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}"}  # fmt: skip
     return "".join(special.get(c, rf"\{c}" if c in "&%$#_{}" else c) for c in text)

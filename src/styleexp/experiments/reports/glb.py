@@ -114,6 +114,12 @@ def diverging(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
     return np.stack([np.interp(values, knots, [c[k] for c in DIVERGING]) for k in range(3)], axis=1)
 
 
+def gradient() -> str:
+    """The heat map's colours as stops of a CSS gradient."""
+    stops = (diverging(np.linspace(-1, 1, 9)) * 255).round().astype(int).tolist()
+    return ", ".join(f"rgb({r} {g} {b})" for r, g, b in stops)
+
+
 def _colour_strip() -> bytes:
     from PIL import Image
 

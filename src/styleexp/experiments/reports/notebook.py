@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from styleexp.experiments.reports import html, page, sweep_page
+from styleexp.experiments.reports import comparison, differing, html, page, sweep_page
 from styleexp.experiments.reports.collect import collect
 from styleexp.runs import finding, results
 from styleexp.system.errors import UserError
@@ -52,16 +52,16 @@ def runs(folder: str | Path, *experiments: str) -> pandas.DataFrame:
     frame["path"] = list(kept)
     frame["status"] = [run.status for run in kept.values()]
     frame["pair"] = [f"{run.part('source')}-{run.part('style')}" for run in kept.values()]
-    given = [sweep_page.settings(run) for run in kept.values()]
-    frame["seed"] = [each.get(sweep_page.SEED, "0") for each in given]
+    given = [differing.settings(run) for run in kept.values()]
+    frame["seed"] = [each.get(differing.SEED, "0") for each in given]
     for key in axes:
-        frame[f"axis.{key}"] = [each.get(key, sweep_page.OMITTED) for each in given]
+        frame[f"axis.{key}"] = [each.get(key, differing.OMITTED) for each in given]
     return frame.reset_index(drop=True).dropna(axis=1, how="all")
 
 
 def belongs(run: Run, experiments: Sequence[str]) -> bool:
     """Whether a run belongs to one of the experiments, by its overrides or its folder."""
-    named = sweep_page.settings(run).get("experiment")
+    named = differing.settings(run).get("experiment")
     return named in experiments or any(part in experiments for part in run.folder.parts)
 
 
@@ -294,7 +294,7 @@ def latex(frame: pandas.DataFrame) -> str:
     def cell(value: Any) -> str:
         if isinstance(value, float | np.floating):
             return "--" if math.isnan(value) else f"{value:.4g}"
-        return "".join(LATEX.get(letter, letter) for letter in str(value))
+        return comparison.escaped(str(value))
 
     kinds = ["r" if frame[column].dtype.kind in "fi" else "l" for column in frame]
     lines = [r"\begin{tabular}{" + "".join(kinds) + "}", r"\toprule"]
@@ -303,13 +303,6 @@ def latex(frame: pandas.DataFrame) -> str:
     for row in frame.itertuples(index=False):
         lines.append(" & ".join(cell(value) for value in row) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
-
-
-LATEX = {letter: f"\\{letter}" for letter in "&%$#_{}"} | {
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-}
 
 
 def _order(column: pandas.Series) -> list[Any]:

@@ -13,10 +13,10 @@ import numpy as np
 from styleexp.experiments.ratings import verdict
 from styleexp.experiments.reports import charts, glb, html
 from styleexp.experiments.reports import shown as shows
-from styleexp.runs import reading
+from styleexp.runs import provenance, reading
 
 if TYPE_CHECKING:
-    from styleexp.experiments.reports.shown import Shown
+    from styleexp.experiments.reports.shown import Shape, Shown
     from styleexp.method.base import Result
     from styleexp.runs.reading import Run
 
@@ -88,12 +88,6 @@ def rewrite(folder: Path, tell: Callable[[str], Any] | None = None) -> Path:
 
 def build(run: Run, shown: Shown) -> str:
     """Render the page as HTML."""
-    style_picture = None
-    if isinstance(shown.style, np.ndarray):
-        from PIL import Image
-
-        pixels = (shown.style * 255).round().astype(np.uint8)
-        style_picture = html.data_uri(Image.fromarray(pixels), STYLE_PIXELS, "JPEG")
     return html.render(
         "run.html",
         ["viewers.js", "run.js"],
@@ -102,11 +96,17 @@ def build(run: Run, shown: Shown) -> str:
         panels=panels(run, shown),
         blocks={f"glb-{k}": html.packed(content) for k, content in shown.files().items()},
         viewer=html.viewer(),
-        style_picture=style_picture,
+        style_picture=style_picture(shown.style),
         heat=_heat(shown),
         curves=curves(run),
-        warnings=[*(run.record.get("notes") or ()), *run.problems, *shown.missing],
-        assets=_assets(run),
+        warnings=[
+            *(run.record.get("notes") or ()),
+            *provenance.resumptions(run.record),
+            *run.problems,
+            *shown.missing,
+        ],
+        inputs=_inputs(run),
+        made_with=provenance.made_with(run.record),
         still=html.picture(run.folder / "preview.png", STILL_PIXELS),
         meanings=MEANINGS,
         verdict=verdict(run.metrics),
@@ -114,6 +114,16 @@ def build(run: Run, shown: Shown) -> str:
         overridden={override.lstrip("+~").split("=")[0] for override in run.overrides},
         plain=html.plain,
     )
+
+
+def style_picture(style: Shape | np.ndarray | None) -> str | None:
+    """A style that is a picture, as a data URI; None for a mesh."""
+    if not isinstance(style, np.ndarray):
+        return None
+    from PIL import Image
+
+    pixels = (style * 255).round().astype(np.uint8)
+    return html.data_uri(Image.fromarray(pixels), STYLE_PIXELS, "JPEG")
 
 
 def facts(run: Run, shown: Shown) -> list[tuple[str, str]]:
@@ -183,9 +193,8 @@ def _heat(shown: Shown) -> dict[str, str] | None:
     """The heat map's legend."""
     if shown.displacement is None or shown.reach == 0:
         return None
-    stops = (glb.diverging(np.linspace(-1, 1, 9)) * 255).round().astype(int).tolist()
     return {
-        "gradient": ", ".join(f"rgb({r} {g} {b})" for r, g, b in stops),
+        "gradient": glb.gradient(),
         "reach": f"{shown.reach:.3g}",
         "share": f"{100 * shown.reach / shown.radius:.2g}",
         "outermost": f"{shown.displacement.max():.3g}",
@@ -193,8 +202,8 @@ def _heat(shown: Shown) -> dict[str, str] | None:
     }
 
 
-def _assets(run: Run) -> list[dict[str, str]]:
-    """Origin of source and style, with licence and author if known."""
+def _inputs(run: Run) -> list[dict[str, str]]:
+    """Origin of source and style, with licence and author if known, and of plugins."""
     from styleexp.inputs import assets
 
     rows = []
@@ -212,6 +221,18 @@ def _assets(run: Run) -> list[dict[str, str]]:
                 "name": str(run.config.get(f"{kind}.path") or row.get("name") or row.get("path")),
                 "sha256": row.get("sha256") or "–",
                 "origin": origin,
+            }
+        )
+    for each in run.record.get("plugins") or ():
+        package = " ".join(filter(None, [each.get("distribution"), each.get("version")]))
+        rows.append(
+            {
+                "kind": f"{each.get('kind')}, a plugin",
+                "name": str(each.get("name")),
+                "sha256": each.get("sha256") or "–",
+                "origin": ", ".join(
+                    filter(None, [package, each.get("file") or each.get("origin")])
+                ),
             }
         )
     return rows

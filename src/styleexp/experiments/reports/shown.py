@@ -56,13 +56,16 @@ class Shown:
             return 0.0
         return float(np.percentile(np.abs(self.displacement), WITHIN))
 
-    def files(self, bare: bool = False) -> dict[str, bytes]:
-        """One GLB per mesh; source and result share a frame. See `glb.glb` for ``bare``."""
+    def files(
+        self, bare: bool = False, heat: Float[np.ndarray, " vertices"] | None = None
+    ) -> dict[str, bytes]:
+        """One GLB per mesh; source and result share a frame. ``heat``, in [-1, 1], colours the
+        result instead of its displacement. See `glb.glb` for ``bare``."""
         pair = [shape for shape in (self.source, self.result) if shape is not None]
         reach = max((float(np.abs(shape.vertices).max()) for shape in pair), default=1.0)
         extent = math.ceil(1e4 * reach) / 1e4  # equal for a result read in single precision
-        values = None
-        if self.displacement is not None:
+        values = heat
+        if heat is None and self.displacement is not None:
             values = np.clip(self.displacement / (self.reach or 1.0), -1, 1)
         made = {}
         if self.source is not None:

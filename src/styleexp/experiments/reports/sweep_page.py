@@ -9,18 +9,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from styleexp.experiments.reports import charts, comparison, html, page
+from styleexp.experiments.reports import charts, comparison, differing, html, page
 from styleexp.experiments.reports.comparison import Comparison
+from styleexp.experiments.reports.differing import OMITTED, SEED, settings
 from styleexp.runs import finding
 from styleexp.runs.reading import Run
 from styleexp.runs.records import RunFolder
 from styleexp.system.errors import UserError
 
 NAME = "report.html"
-SEED = "optim.seed"
-"""Key of the seed; runs that differ only in it share a cell."""
-OMITTED = "not given"
-"""Axis value of a run without an override for it."""
 
 
 @dataclass(frozen=True)
@@ -131,18 +128,39 @@ def build(folder: Path, runs: list[Run]) -> str:
     return html.render(
         "sweep.html",
         ["sweep.js"],
-        title=folder.resolve().name,
+        title=title(folder, sweeps),
         sweeps=sweeps,
         states=_count(runs),
         pictures={run.folder: _picture(run) for run in runs},
         headlines={run.folder: headline(run) for run in runs},
         links={run.folder: _link(run, folder) for run in runs},
+        searched={run.folder: searched(run) for run in runs},
         measures={sweep.name: measures(sweep) for sweep in sweeps},
         plots={sweep.name: plots(sweep) for sweep in sweeps},
         comparisons={sweep.name: comparisons(sweep) for sweep in sweeps},
         better=comparison.BETTER,
         caption=comparison.CAPTION,
     )
+
+
+def title(folder: Path, sweeps: list[Sweep]) -> str:
+    """The folder's name, of one that is named by the time also its parent's, and what differs."""
+    place = folder.resolve()
+    name = place.name
+    if finding.DATED.fullmatch(name):
+        name = f"{place.parent.name}, {name.replace('_', ' ', 1)}"
+    if len(sweeps) != 1:
+        return f"{name}: {len(sweeps)} sweeps"
+    (sweep,) = sweeps
+    parts = [told] if (told := differing.told(sweep.axes)) else []
+    if sweep.seeds:
+        parts.append(f"{len({settings(run).get(SEED) for run in sweep.runs})} seeds")
+    return f"{name}: {'; '.join(parts)}" if parts else name
+
+
+def searched(run: Run) -> str:
+    """What the page's filter looks in: a run's folder, status, overrides and reason."""
+    return " ".join([run.folder.name, run.status, *run.overrides, run.remark or ""]).lower()
 
 
 def split(folder: Path, runs: list[Run]) -> list[Sweep]:
@@ -167,12 +185,6 @@ def axes(runs: list[Run]) -> dict[str, list[str]]:
         if len(values) > 1:
             found[key] = sorted(values, key=float) if all(map(_is_number, values)) else values
     return found
-
-
-def settings(run: Run) -> dict[str, str]:
-    """A run's overrides by key, without Hydra's prefixes and without ``hydra.*`` keys."""
-    pairs = (override.lstrip("+~").partition("=") for override in run.overrides)
-    return {key: value for key, _, value in pairs if not key.startswith("hydra")}
 
 
 def headline(run: Run) -> tuple[str, float] | None:

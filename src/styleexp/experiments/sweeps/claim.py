@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from styleexp.config import unread
 from styleexp.config.overrides import quote
 from styleexp.experiments.sweeps.settings import product
-from styleexp.runs import reading
+from styleexp.runs import identity, reading
 from styleexp.runs.jobs import JOBS, Job, listed
 from styleexp.runs.records import RunFolder
 from styleexp.system import locks
@@ -47,17 +47,17 @@ def sweep(config: DictConfig) -> Path:
     """
     folder = _claim(config, "sweep")
     try:
-        configs: list[Config] = []
+        configs: dict[str, Config] = {}
         jobs = _jobs(config, folder, configs)
         content: dict[str, Any] = {"search": _search(config)}
         if jobs is not None:
             content = {"jobs": [job.overrides for job in jobs], "keys": [job.key for job in jobs]}
-        _refuse_others(folder, jobs or (), content)
+        _refuse_others(folder, jobs or (), configs, content)
     except BaseException:
         locks.drop(folder)
         raise
     RunFolder(folder).write_json(JOBS, content)
-    if note := unread.note(configs, _given(config)):
+    if note := unread.note(list(configs.values()), _given(config)):
         print(f"note: {note}", flush=True)
     return folder
 
@@ -77,13 +77,13 @@ def _claim(config: DictConfig, kind: str) -> Path:
         except locks.Busy:
             raise UserError(busy(folder, kind)) from None
         return folder
-    fresh = _fresh(folder)
-    if fresh != folder:
+    made = fresh(folder)
+    if made != folder:
         with read_write(config.hydra), open_dict(config.hydra):
-            config.hydra[kind].dir = str(fresh)
+            config.hydra[kind].dir = str(made)
             # A sweep's jobs are composed again, with these.
-            config.hydra.overrides.hydra.append(f"{named}={quote(str(fresh))}")
-    return fresh
+            config.hydra.overrides.hydra.append(f"{named}={quote(str(made))}")
+    return made
 
 
 def busy(folder: Path, kind: str = "run") -> str:
@@ -94,8 +94,11 @@ def busy(folder: Path, kind: str = "run") -> str:
     )
 
 
-def _fresh(folder: Path) -> Path:
-    """Create and lock an unused folder: this one, or the first free one with a number appended."""
+def fresh(folder: Path) -> Path:
+    """Create and lock an unused folder: this one, or the first free one with a number appended.
+
+    The lock is for this process's next `locks.hold`.
+    """
     folder.parent.mkdir(parents=True, exist_ok=True)
     for each in _names(folder):
         with suppress(FileExistsError, locks.Busy):
@@ -111,15 +114,14 @@ def _names(folder: Path) -> Iterator[Path]:
         yield folder.with_name(f"{folder.name}_{number}")
 
 
-def _jobs(config: DictConfig, folder: Path, configs: list[Config]) -> list[Job] | None:
-    """The sweep's jobs with their keys; None if the sweeper generates them dynamically. Appends
-    their configurations to ``configs``."""
+def _jobs(config: DictConfig, folder: Path, configs: dict[str, Config]) -> list[Job] | None:
+    """The sweep's jobs with their keys; None if the sweeper generates them dynamically. Puts their
+    configurations into ``configs``, by the jobs' names."""
     from hydra.core.global_hydra import GlobalHydra
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import open_dict
 
     from styleexp.config import compose
-    from styleexp.runs import identity
 
     if "BasicSweeper" not in config.hydra.sweeper._target_:
         return None
@@ -135,8 +137,8 @@ def _jobs(config: DictConfig, folder: Path, configs: list[Config]) -> list[Job] 
                 composed.hydra.job.id = composed.hydra.job.num = number
                 HydraConfig.instance().set_config(composed)
                 del composed["hydra"]
-            configs.append(compose.typed(composed))
-            key = identity.job_key(configs[-1])
+            configs[str(number)] = compose.typed(composed)
+            key = identity.job_key(configs[str(number)])
         jobs.append(Job(str(number), tuple(overrides), folder / str(number), key))
     HydraConfig.instance().cfg = before
     return jobs
@@ -163,18 +165,25 @@ def _search(config: DictConfig) -> dict[str, Any]:
     }
 
 
-def _refuse_others(folder: Path, jobs: Sequence[Job], content: dict[str, Any]) -> None:
-    """Raise `UserError` if a folder contains results of other jobs. Failed jobs may be
-    overwritten."""
+def _refuse_others(
+    folder: Path, jobs: Sequence[Job], configs: Mapping[str, Config], content: dict[str, Any]
+) -> None:
+    """Raise `UserError` if a folder contains results of other jobs. Jobs that failed, and those
+    that differ only in the code of their plugins, may be overwritten."""
+    from styleexp.runs import identity
+
     remedy = "choose another folder with hydra.sweep.dir=FOLDER, or remove it."
-    before = listed(folder)
-    if before is not None:
+    planned = listed(folder)
+    if planned is not None:
         asked = "jobs" if "jobs" in content else "search"
-        if before.get(asked) != json.loads(json.dumps(content[asked])):
+        if planned.get(asked) != json.loads(json.dumps(content[asked])):
             raise UserError(f"'{folder}' contains another sweep: {remedy}")
     for job in jobs:
         run = reading.of_job(job)
         if run.status == "newer":
             raise UserError(f"cannot run in '{job.folder}': {run.reason}")
         if run.status == "other" and run.last_status != "failed":
+            record, made = reading.read(job.folder).record, configs.get(job.name)
+            if made is not None and identity.edited_since(made, job.overrides, record):
+                continue
             raise UserError(f"'{job.folder}' doesn't belong to this sweep ({run.reason}): {remedy}")

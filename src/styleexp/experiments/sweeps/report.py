@@ -61,8 +61,14 @@ def exit_code(folder: Path) -> int:
 
 
 def finish(folder: Path, name: str | None = None) -> None:
-    """Write table and figure of Hydra's sweep in ``folder``."""
-    report(planned(folder), folder, name or str(folder))
+    """Write table and figure of Hydra's sweep in ``folder`` and, unless its runs have no pages, its
+    page."""
+    from styleexp.experiments.reports import sweep_page
+
+    jobs = planned(folder)
+    report(jobs, folder, name or str(folder))
+    if any(reading.of_job(job).config.get("report") for job in jobs):
+        _print(str(sweep_page.write(folder, run_pages=False)))
 
 
 def report(jobs: Sequence[Job], folder: Path, title: str) -> None:

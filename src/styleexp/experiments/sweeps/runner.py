@@ -231,8 +231,8 @@ def _work(config: DictConfig, root: Path, job: Job) -> None:
             typed = compose.typed(config)
             if job.key not in (None, identity.job_key(typed)):
                 raise UserError(
-                    "its source or style file has changed since the plan was read: start the plan "
-                    "again."
+                    "its source or style file, or the code of a plugin, has changed since the plan "
+                    "was read: start the plan again."
                 )
             launchers.place(HydraConfig.get(), typed.device)
             code = begin(typed, folder, [*asked, "hydra.mode=RUN"])

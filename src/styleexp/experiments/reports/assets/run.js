@@ -3,7 +3,7 @@
   const press = (id, state) => byId(id)?.setAttribute("aria-pressed", String(state));
   const state = byId("viewer-state"), stage = byId("stage");
 
-  byId("copy").addEventListener("click", async () => {
+  byId("copy")?.addEventListener("click", async () => {
     getSelection().selectAllChildren(byId("command"));
     try {
       await navigator.clipboard.writeText(byId("command").textContent);
@@ -14,8 +14,8 @@
   });
   if (!stage) return;
 
-  const keys = ["source", "style", "result"].filter((key) => byId(`view-${key}`));
-  const viewers = keys.map((key) => byId(`view-${key}`));
+  const viewers = [...stage.querySelectorAll("model-viewer")];
+  const keys = viewers.map((viewer) => viewer.id.slice("view-".length));
   const trouble = keys.length ? obstacle() : null;
   if (trouble) {
     state.textContent = `${trouble} The still pictures below show them.`;
@@ -27,7 +27,7 @@
     try {
       await Promise.all(keys.map(async (key) => {
         files[key] ??= await inflate(`glb-${key}`);
-        const surface = key === "result" && on("heat") ? HEAT : SURFACE;
+        const surface = key.startsWith("result") && on("heat") ? HEAT : SURFACE;
         await show(byId(`view-${key}`), files[key], on("wire") ? [surface, EDGES] : [surface]);
       }));
       state.hidden = true;
@@ -59,7 +59,7 @@
     link.release();
     for (const viewer of viewers) aim(viewer, HOME.orbit, HOME.target, HOME.field);
   });
-  byId("cut").addEventListener("input", () => stage.style.setProperty("--cut", `${byId("cut").value}%`));
+  byId("cut")?.addEventListener("input", () => stage.style.setProperty("--cut", `${byId("cut").value}%`));
   for (const viewer of viewers) {
     viewer.addEventListener("pointerdown", () => press("spin", false));
     viewer.addEventListener("keydown", (event) => {
