@@ -154,17 +154,19 @@ def jobs(plan: Plan, folder: Path, overrides: Sequence[str] = ()) -> dict[str, l
     import hydra
 
     from styleexp.config import compose
+    from styleexp.config.many import Composer
 
     compose.register()
     found: dict[str, list[Planned]] = {}
     first: dict[str, Planned] = {}
     with hydra.initialize_config_module("styleexp.conf", version_base="1.3"):
+        composer = Composer()
         for entry in plan.experiments:
             assert entry.name is not None
             listed = [each for part in _parts(plan, entry, overrides) for each in part]
             made = []
             for each, settings in zip(listed, varying(listed), strict=True):
-                config = compose.typed(hydra.compose("config", [*each, "hydra.mode=RUN"]))
+                config = composer.compose([*each, "hydra.mode=RUN"])
                 key = job_key(config)
                 name = f"{entry.name}/{_readable(settings)}-{key[:8]}"
                 job = Planned(name, tuple(each), folder / name, key, entry.name)
@@ -178,10 +180,10 @@ def _parts(plan: Plan, entry: Entry, overrides: Sequence[str]) -> Iterator[list[
     base = [f"+experiment={entry.experiment}"] if entry.experiment else []
     base += [f"profile={plan.profile}"]
     base += understood([*plan.overrides, *entry.overrides, *overrides], multirun=True)
+    params = _params(base)  # what a pair chooses doesn't change them
     for pair in entry.pairs or [[]]:
         chosen = [f"{k}={v}" for k, v in zip(("source", "style"), pair, strict=False)]
         given = [*base, *understood(chosen)]
-        params = _params(given)
         seeds = entry.seeds if entry.seeds is not None else plan.seeds
         if seeds and (entry.seeds is not None or "optim.seed" not in params):
             given.append(f"optim.seed={','.join(map(str, seeds))}")
