@@ -150,7 +150,8 @@ def test_dry_run_prints_the_very_commands_and_runs_nothing(undisturbed, tmp_path
     done = sweep(write_plan(tmp_path), "--folder", "out", "--dry-run", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert not (tmp_path / "out").exists()
-    assert "# styles, Fig. 2: about 1 minutes on two cores" in done.stdout
+    assert "# styles, Fig. 2: 3 jobs; left: about 2 core-minutes (plan's estimate)" in done.stdout
+    assert "and 1 job of unknown time" in done.stdout
     commands = [line for line in done.stdout.splitlines() if line.startswith("styleexp ")]
     assert len(commands) == JOBS + 1
     assert "# the same job as above" in commands[-1]
@@ -479,6 +480,89 @@ def test_what_slurm_is_asked_for(tmp_path):
         assert f"#SBATCH {line}" in asked
     assert "submitit.core._submit" in asked
     assert {job["state"] for job in manifest.read(tmp_path / "out").values()} == {"missing"}
+    told = slurm_lines(tmp_path, "--jobs=3", "hydra.launcher.partition=gpu")
+    lines = [line for line in asked.splitlines() if line.startswith("#SBATCH")]
+    assert [line for line in told if "put=" not in line and "error=" not in line] == [
+        line for line in lines if "put=" not in line and "error=" not in line
+    ]
+
+
+def slurm_lines(folder, *arguments):
+    """The options in the batch file that ``--check`` shows; SLURM's commands may be missing."""
+    done = sweep(
+        "plan.yaml", "--folder=out", "--check", "--launcher=submitit_slurm", *arguments, cwd=folder
+    )
+    assert "Traceback" not in done.stderr
+    return [line.strip() for line in done.stdout.splitlines() if "#SBATCH" in line]
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (["--launcher=submitit_slurm", "hydra.launcher.partitoin=gpu"], "did you mean 'partition'"),
+        (["--launcher=submitit_slurm", "+hydra.launcher.mem=8"], "did you mean 'mem_gb'"),
+        (["hydra.launcher.partition=gpu"], "the launcher 'basic' has no keys"),
+        (["--launcher=joblib", "hydra.lancher.n_jobs=3"], "did you mean 'launcher'"),
+        (["--launcher=slurm"], "did you mean 'submitit_slurm'"),
+    ],
+)
+def test_mistyped_launchers_and_their_keys_get_one_sentence(given, told, tmp_path):
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher", reason="needs the extra sweep")
+    done = sweep(write_plan(tmp_path), *given, cwd=tmp_path)
+    assert done.returncode == 2
+    assert told in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["plan.yaml"]
+
+
+LACKING = """\
+profile: smoke
+overrides: [encoder=vgg19_random, metrics.judge=none]
+experiments:
+  - name: meshes
+    minutes: {smoke: 3}
+    overrides: [method=robust, style=bubble, "source=torus,spot", "optim.seed=0,1,2"]
+  - name: pictures
+    pairs: [[torus, gravel], [torus, none.png]]
+  - name: weights
+    overrides: [method=robust, source=torus, style=rail, "encoder=vgg19,clip"]
+"""
+
+
+def test_a_check_names_what_is_missing_once_and_runs_nothing(tmp_path):
+    empty = {"STYLEEXP_ASSETS": "", "STYLEEXP_CACHE": str(tmp_path / "cache")}
+    done = sweep(write_plan(tmp_path, LACKING), "--folder=out", "--check", cwd=tmp_path, **empty)
+    assert done.returncode == 2, done.stderr
+    for told, jobs in (("'spot'", 3), ("'gravel'", 1), ("'none.png'", 1), ("'vgg19'", 1)):
+        assert done.stdout.count(told) == 1
+        rest = done.stdout.partition(told)[2].splitlines()
+        assert f"needed by {jobs} of 10 jobs" in rest[1]
+    assert "6 jobs; left: about 6 core-minutes (plan's estimate)" in done.stdout
+    assert "and 4 jobs of unknown time; disk space unknown" in done.stdout
+    if have("hydra_plugins.hydra_joblib_launcher"):
+        refused = sweep("plan.yaml", "--folder=out", "--launcher=joblib", cwd=tmp_path, **empty)
+        assert refused.returncode == 2
+        assert "nothing was started" in refused.stderr.splitlines()[-1]
+    assert not (tmp_path / "out").exists()
+
+
+def have(module):
+    from importlib.util import find_spec
+
+    return find_spec(module.partition(".")[0]) is not None and find_spec(module) is not None
+
+
+def test_a_check_tells_the_cost_of_what_is_left_from_what_is_done(undisturbed, tmp_path):
+    import shutil
+
+    shutil.copytree(undisturbed[0], tmp_path / "out")
+    shutil.rmtree(next((tmp_path / "out" / "styles").glob("bubble-*")))
+    done = sweep(write_plan(tmp_path), "--folder=out", "--check", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "3 jobs, 2 done; left: about" in done.stdout
+    assert "MB (measured on 2 jobs)" in done.stdout
+    assert "1 job, all done" in done.stdout
+    assert "nothing is missing" in done.stdout
 
 
 IDLE = """\

@@ -6,9 +6,9 @@ import argparse
 import os
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from styleexp.system import gpus
 from styleexp.system.errors import UserError
@@ -58,6 +58,10 @@ def _parser() -> argparse.ArgumentParser:
                         "submitit_slurm or ray; default: the plan's")  # fmt: skip
     parser.add_argument("--jobs", type=int, metavar="N", help="run N jobs in parallel")
     parser.add_argument("--retry", action="store_true", help="run failed jobs again")
+    parser.add_argument("--check", action="store_true", help="say what is missing, how the jobs "
+                        "would be started and what they cost; run nothing")  # fmt: skip
+    parser.add_argument("--no-check", action="store_true", help="start although something is "
+                        "missing: the jobs that need it fail")  # fmt: skip
     parser.add_argument("--dry-run", action="store_true", help="print the commands, run nothing")
     return parser
 
@@ -81,17 +85,27 @@ def _run(options: argparse.Namespace) -> int:
         print(f"note: relative paths refer to '{home}', where this plan was started.", flush=True)
         options.plan, folder = options.plan.absolute(), folder.absolute()
         os.chdir(home)
-    own = [each for each in options.overrides if each.startswith("hydra.")]
+    own = [each for each in options.overrides if each.lstrip("+~").startswith("hydra.")]
     launcher = launchers.overrides(options.launcher or read.launcher, options.jobs) + own
-    chosen = [each for each in options.overrides if not each.startswith("hydra.")]
+    chosen = [each for each in options.overrides if each not in own]
+    try:
+        with launchers.composed(folder, launcher) as (_, config):
+            hydra = config.hydra
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(explain(error)) from error
     try:
         by_entry = plan.jobs(read, folder, chosen)
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(f"{options.plan}: {explain(error)}") from error
     jobs = list({job.name: job for listed in by_entry.values() for job in listed}.values())
     if options.dry_run:
-        _show_commands(read, by_entry, chosen)
+        _show_commands(read, by_entry, _profile(read, chosen))
         return 0
+    if options.check:
+        return _check(read, by_entry, folder, _profile(read, chosen), hydra)
+    if launchers.name_of(hydra) != "basic" and not options.no_check:
+        launchers.check_commands(hydra)
+        _refuse_missing(jobs)
     try:
         manifest.write(folder, jobs)
         if options.retry:
@@ -119,28 +133,80 @@ def _report(read: Plan, by_entry: dict[str, list[Planned]], folder: Path) -> int
     return 0 if set(states) == {"done"} else 2
 
 
-def _show_commands(
-    read: Plan, by_entry: dict[str, list[Planned]], overrides: Sequence[str]
-) -> None:
-    """Print the commands, with each experiment's figure and cost, and mark finished jobs."""
+def _profile(read: Plan, overrides: Sequence[str]) -> str:
+    given = [o.removeprefix("profile=") for o in overrides if o.startswith("profile=")]
+    return given[-1] if given else read.profile
+
+
+def _unfinished(jobs: Iterable[Planned]) -> list[Planned]:
     from styleexp.runs import reading
 
-    given = [o.removeprefix("profile=") for o in overrides if o.startswith("profile=")]
-    profile = given[-1] if given else read.profile
-    total, seen = 0.0, set()
+    return [job for job in jobs if reading.of_job(job).status != "done"]
+
+
+def _refuse_missing(jobs: Sequence[Planned]) -> None:
+    """Raise `UserError` if something is missing that unfinished jobs need."""
+    from styleexp.experiments.sweeps import preflight
+
+    left = _unfinished(jobs)
+    if problems := preflight.missing(left):
+        print(*preflight.told(problems, left), sep="\n", file=sys.stderr)
+        count = len({job.name for stopped in problems.values() for job in stopped})
+        raise UserError(
+            f"{count} of {len(left)} jobs can't run; nothing was started: see above, or start "
+            "the others with --no-check."
+        )
+
+
+def _check(
+    read: Plan, by_entry: dict[str, list[Planned]], folder: Path, profile: str, hydra: Any
+) -> int:
+    """Print what is missing, how jobs are started and what they cost; return the exit code."""
+    from styleexp.experiments.sweeps import costs, launchers, preflight
+
+    jobs = list({job.name: job for listed in by_entry.values() for job in listed}.values())
+    left = _unfinished(jobs)
+    print(f"{len(jobs)} jobs, {len(jobs) - len(left)} done, in {folder} (profile={profile})")
+    found = costs.of_plan(read, by_entry, profile)
+    width = max(map(len, found))
+    for name, cost in found.items():
+        print(f"  {name:<{width}}  {cost.words()}")
+    if left:
+        print(f"left in all: {costs.total(found)}")
+        name, at_once = launchers.name_of(hydra), launchers.at_once(hydra)
+        print(f"launcher {name}: {len(left)} tasks, {at_once or 'all'} at a time")
+        for line in launchers.described(hydra, len(left)):
+            print(line)
+    problems = preflight.missing(left)
+    try:
+        launchers.check_commands(hydra)
+    except UserError as error:
+        problems = {str(error): left} | problems
+    if not problems:
+        print("nothing is missing.")
+        return 0
+    print("missing or wrong:")
+    print(*preflight.told(problems, left), sep="\n")
+    return 2
+
+
+def _show_commands(read: Plan, by_entry: dict[str, list[Planned]], profile: str) -> None:
+    """Print the commands, with each experiment's figure and cost, and mark finished jobs."""
+    from styleexp.experiments.sweeps import costs
+    from styleexp.runs import reading
+
+    found, seen = costs.of_plan(read, by_entry, profile), set()
     for entry in read.experiments:
         assert entry.name is not None
-        minutes = entry.minutes.get(profile)
-        cost = "unknown cost" if minutes is None else f"about {minutes:g} minutes on two cores"
-        total += minutes or 0
-        print(f"# {entry.name}{f', {entry.figure}' if entry.figure else ''}: {cost}")
+        figure = f", {entry.figure}" if entry.figure else ""
+        print(f"# {entry.name}{figure}: {found[entry.name].words()}")
         for job in by_entry[entry.name]:
             status = reading.of_job(job).status
             note = "" if status == "missing" else f"  # {status}"
             note = "  # the same job as above" if job.name in seen else note
             seen.add(job.name)
             print(job.command() + note)
-    print(f"# {len(seen)} jobs, about {total:g} minutes on two cores (profile={profile})")
+    print(f"# {len(seen)} jobs, left: {costs.total(found)} (profile={profile})")
 
 
 def _status(folder: Path) -> int:

@@ -14,6 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from styleexp.encoders.options import judge_name
 from styleexp.experiments import endings, progress
 from styleexp.experiments.sweeps.claim import PATIENCE, busy
 from styleexp.runs import identity, origins, reading, records
@@ -348,6 +349,4 @@ def _measure(result: Result, config: Config) -> dict[str, float]:
 
 def _judge_name(config: Config) -> str | None:
     """The encoder that measures the result; None if it isn't measured with one."""
-    from styleexp.experiments import metrics
-
-    return metrics.judge_name(config.metrics.judge, config.encoder.name)
+    return judge_name(config.metrics.judge, config.encoder.name)

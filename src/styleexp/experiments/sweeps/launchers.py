@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 import os
+import re
+import shlex
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
+from styleexp.config.overrides import quote
 from styleexp.system import gpus
-from styleexp.system.errors import UserError
+from styleexp.system.errors import UserError, unknown_name
 
 
 def cores() -> int:
@@ -39,9 +47,108 @@ def overrides(name: str, jobs: int | None = None) -> list[str]:
     return [f"launcher={name}", f"{JOBS[name]}={jobs}"]
 
 
+@contextmanager
+def composed(folder: Path, launcher: Sequence[str]) -> Iterator[tuple[Any, Any]]:
+    """Hydra's loader and its configuration with these overrides, for jobs below ``folder``. Hydra
+    is initialised within the context.
+
+    Raises `UserError` for an unknown key of Hydra's, and Hydra's exceptions.
+    """
+    import hydra
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.types import RunMode
+
+    from styleexp.config import compose
+
+    compose.register()
+    with hydra.initialize_config_module("styleexp.conf", version_base="1.3"):
+        composer: Any = GlobalHydra.instance().hydra
+
+        def composed(overrides: Sequence[str]) -> Any:
+            given = [f"hydra.sweep.dir={quote(str(folder))}", *overrides]
+            return composer.compose_config(
+                "config", given, run_mode=RunMode.MULTIRUN, from_shell=False
+            )
+
+        own = [each for each in launcher if each.lstrip("+~").startswith("hydra.")]
+        if own:
+            plain = composed([each for each in launcher if each.startswith("launcher=")])
+            for each in own:
+                _check_key(plain.hydra, re.split("[=@]", each.lstrip("+~"))[0], launcher)
+        yield composer.config_loader, composed(launcher)
+
+
+def _check_key(hydra: Any, key: str, launcher: Sequence[str]) -> None:
+    """Raise `UserError` for a key that this configuration of Hydra's doesn't have, with the nearest
+    that it has. Mappings without a schema may be added to."""
+    from omegaconf import OmegaConf
+
+    node, above = hydra, "hydra"
+    for name in key.split(".")[1:]:
+        if not OmegaConf.is_dict(node):
+            return  # Hydra says what is wrong
+        known = [str(each) for each in node if not str(each).startswith("_")]
+        if name not in known:
+            if OmegaConf.get_type(node) is dict:
+                return  # a + adds it; Hydra says so where it is missing
+            if not known:
+                chosen = [each.partition("=")[2] for each in launcher if "launcher=" in each]
+                raise UserError(
+                    f"the launcher '{chosen[0]}' has no keys, but '{key}' was given: choose "
+                    "another with --launcher."
+                )
+            raise unknown_name(f"key of {above},", name, known)
+        node, above = node[name], f"{above}.{name}"
+
+
+def described(hydra: Any, tasks: int) -> list[str]:
+    """Lines for the terminal: how the launcher starts that many tasks. For SLURM, the batch file.
+
+    Raises `UserError` if SLURM's commands are missing here.
+    """
+    kind = name_of(hydra)
+    if kind == "submitit_slurm":
+        return ["the batch file for SLURM:", *(f"  {line}" for line in _batch_file(hydra, tasks))]
+    if kind == "submitit_local":
+        return [f"each task in a process of its own, for at most {hydra.launcher.timeout_min} min"]
+    return []
+
+
+def check_commands(hydra: Any) -> None:
+    """Raise `UserError` if the launcher needs commands that this machine doesn't have."""
+    if name_of(hydra) == "submitit_slurm":
+        missing = [name for name in ("sbatch", "srun", "squeue") if shutil.which(name) is None]
+        if missing:
+            raise UserError(
+                f"there is no {' and no '.join(missing)} on this machine: run this on a login "
+                "node of the cluster, or use --launcher submitit_local."
+            )
+
+
+def _batch_file(hydra: Any, tasks: int) -> list[str]:
+    """The batch file that Submitit writes for an array of tasks, as lines."""
+    from omegaconf import OmegaConf
+    from submitit.slurm import slurm
+
+    asked: Any = OmegaConf.to_container(hydra.launcher, resolve=True)
+    folder = asked.pop("submitit_folder")
+    for name in ("_target_", "max_num_timeout"):
+        asked.pop(name)
+    names = slurm.SlurmExecutor._equivalence_dict()
+    converted: dict[str, Any] = {
+        str(names.get(key, key)): value for key, value in asked.items() if value is not None
+    }
+    if "mem" in converted:
+        converted["mem"] = slurm._convert_mem(converted["mem"])
+    command = f"{shlex.quote(sys.executable)} -u -m submitit.core._submit {shlex.quote(folder)}"
+    count = tasks if tasks > 1 else None  # Submitit submits a single task without an array
+    text = slurm._make_sbatch_string(command, folder, map_count=count, **converted)
+    return [line for line in text.splitlines() if line and line != "# Parameters"]
+
+
 def batch_size(hydra: Any) -> int | None:
     """Maximum number of jobs per batch for the launcher; None for no limit."""
-    kind = _kind(hydra)
+    kind = name_of(hydra)
     if kind == "submitit_local":
         return side_by_side(hydra)
     return MANY if kind in ("basic", "joblib") else None
@@ -49,7 +156,7 @@ def batch_size(hydra: Any) -> int | None:
 
 def side_by_side(hydra: Any) -> int:
     """Number of parallel jobs on one machine, from Hydra's configuration (``hydra.launcher``)."""
-    kind = _kind(hydra)
+    kind = name_of(hydra)
     if kind == "joblib":
         jobs = int(hydra.launcher.n_jobs)
         return jobs if jobs > 0 else max(1, cores() + 1 + jobs)  # joblib: -1 is all cores
@@ -58,9 +165,20 @@ def side_by_side(hydra: Any) -> int:
     return 1
 
 
+def at_once(hydra: Any) -> int | None:
+    """Maximum number of jobs that run at the same time; None if the launcher doesn't limit it."""
+    kind = name_of(hydra)
+    if kind == "submitit_slurm":
+        return int(hydra.launcher.array_parallelism)
+    if kind == "ray":
+        count = hydra.launcher.ray.init.get("num_cpus")
+        return None if count is None else int(count)
+    return side_by_side(hydra)
+
+
 def threads_each(hydra: Any) -> int:
     """Threads per job, so that parallel jobs don't compete for cores; 0: all cores."""
-    kind = _kind(hydra)
+    kind = name_of(hydra)
     if kind == "submitit_slurm":
         return int(hydra.launcher.cpus_per_task or 0)
     if kind == "ray":
@@ -72,11 +190,12 @@ def threads_each(hydra: Any) -> int:
 def place(hydra: Any, device: str) -> None:
     """Give a job's process a GPU of its own (`gpus.take_one`), unless ``device`` names one or is
     the CPU, or jobs run one after the other in this process."""
-    if _kind(hydra) != "basic" and device in ("auto", "cuda"):
+    if name_of(hydra) != "basic" and device in ("auto", "cuda"):
         gpus.take_one()
 
 
-def _kind(hydra: Any) -> str:
+def name_of(hydra: Any) -> str:
+    """The launcher's name, from Hydra's configuration."""
     target = str(hydra.launcher._target_)
     for word, kind in (
         ("LocalLauncher", "submitit_local"),

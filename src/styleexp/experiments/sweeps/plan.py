@@ -24,13 +24,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import field as option
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from styleexp.config.overrides import literal, quote, understood
 from styleexp.experiments.sweeps.settings import product, varying
 from styleexp.runs.identity import job_key
 from styleexp.runs.jobs import Job
 from styleexp.system.errors import UserError, unknown_name
+
+if TYPE_CHECKING:
+    from styleexp.config.schema import Config
 
 
 @dataclass
@@ -67,6 +70,7 @@ class Planned(Job):
     """A job of a plan. ``name`` is its folder below the plan's."""
 
     entry: str = ""
+    config: Config | None = option(default=None, compare=False, repr=False)
 
     def command(self) -> str:
         """The equivalent command."""
@@ -169,7 +173,7 @@ def jobs(plan: Plan, folder: Path, overrides: Sequence[str] = ()) -> dict[str, l
                 config = composer.compose([*each, "hydra.mode=RUN"])
                 key = job_key(config)
                 name = f"{entry.name}/{_readable(settings)}-{key[:8]}"
-                job = Planned(name, tuple(each), folder / name, key, entry.name)
+                job = Planned(name, tuple(each), folder / name, key, entry.name, config)
                 shared = first.setdefault(key, job)
                 made.append(dataclasses.replace(job, name=shared.name, folder=shared.folder))
             found[entry.name] = made

@@ -114,23 +114,14 @@ def _progress(folder: Path, jobs: Sequence[Planned]) -> list[Any]:
 def _launch(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> Exception | None:
     """Run the jobs with Hydra's launcher; return the exception that it raised or that killed a
     job."""
-    import hydra
     from hydra._internal.callbacks import Callbacks
-    from hydra.core.global_hydra import GlobalHydra
     from hydra.core.plugins import Plugins
     from hydra.core.utils import JobStatus
-    from hydra.types import HydraContext, RunMode
+    from hydra.types import HydraContext
 
-    with hydra.initialize_config_module("styleexp.conf", version_base="1.3"):
-        composed: Any = GlobalHydra.instance().hydra
-        config = composed.compose_config(
-            "config",
-            [f"hydra.sweep.dir={quote(str(folder))}", *launcher],
-            run_mode=RunMode.MULTIRUN,
-            from_shell=False,
-        )
+    with launchers.composed(folder, launcher) as (loader, config):
         started = Plugins.instance().instantiate_launcher(
-            hydra_context=HydraContext(composed.config_loader, Callbacks()),
+            hydra_context=HydraContext(loader, Callbacks()),
             task_function=task,
             config=config,
         )
