@@ -12,7 +12,7 @@ from contextlib import suppress
 
 import pytest
 
-from styleexp.experiments.sweeps import launchers, manifest, plan
+from styleexp.experiments.sweeps import launchers, manifest, plan, state
 from styleexp.runs import reading
 from styleexp.runs.identity import job_key
 from styleexp.system import locks
@@ -379,7 +379,8 @@ def test_a_job_that_kills_its_process_each_time_fails_and_the_others_go_on(tmp_p
     )
     write_plan(tmp_path, text)
     plugin = {"STYLEEXP_PLUGINS": "renderer=deadly:SPEC", "PYTHONPATH": str(tmp_path)}
-    done = sweep("plan.yaml", "--launcher", "joblib", "--folder", "out", cwd=tmp_path, **plugin)
+    given = ("plan.yaml", "--launcher=joblib", "--per-task=2", "--folder=out")  # both in one task
+    done = sweep(*given, cwd=tmp_path, **plugin)
     assert done.returncode == 2, done.stderr
     assert "its process died 3 times" in done.stdout
     states = [job["state"] for job in manifest.read(tmp_path / "out").values()]
@@ -563,6 +564,79 @@ def test_a_check_tells_the_cost_of_what_is_left_from_what_is_done(undisturbed, t
     assert "MB (measured on 2 jobs)" in done.stdout
     assert "1 job, all done" in done.stdout
     assert "nothing is missing" in done.stdout
+
+
+def test_jobs_of_one_task_are_jobs_of_their_own(undisturbed, tmp_path):
+    """Each has its folder and its record; the one that fails doesn't take the others along."""
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher", reason="needs the extra sweep")
+    text = PLAN.replace("pairs: [[sphere", "pairs: [[none.ply, rail], [sphere")
+    arguments = ("--per-task=5", "--launcher=submitit_local", "--jobs=1", "--folder=out")
+    given = (write_plan(tmp_path, text), *arguments, "keep_checkpoint=false")
+    done = sweep(*given, "--no-check", cwd=tmp_path)
+    assert done.returncode == 2, done.stderr
+    out = tmp_path / "out"
+    assert len(list((out / ".submitit").glob("*/*_submitted.pkl"))) == 1
+    assert results(out) == results(undisturbed[0])
+    ended = [(job["state"], job["attempts"]) for job in manifest.read(out).values()]
+    assert sorted(ended) == [("done", 1)] * JOBS + [("failed", 1)]
+    assert not list(out.glob("*/*/*.safetensors"))
+    assert list(undisturbed[0].glob("*/*/*.safetensors"))
+    for name in results(out):
+        run = reading.read(out / name)
+        assert run.record["threads"] == 1
+        assert f"step {STEPS}/{STEPS}" in (out / name / "log.txt").read_text()
+    again = warm.run("-m", "styleexp", f"resume={out / name}", cwd=tmp_path)
+    assert again.returncode == 2
+    assert "kept no checkpoint" in again.stderr
+
+
+def test_tasks_of_several_jobs_are_for_launchers_that_start_processes(tmp_path):
+    done = sweep(write_plan(tmp_path), "--per-task=2", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "--per-task 2 is not possible with the launcher 'basic'" in done.stderr
+
+
+def test_the_state_tells_the_time_left_and_each_reason_once(undisturbed, tmp_path):
+    import shutil
+
+    shutil.copytree(undisturbed[0], tmp_path / "out")
+    first, second, third, fourth = sorted(results(tmp_path / "out"))
+    for name, status in ((first, "failed"), (second, "failed"), (third, "running")):
+        content = {"schema": 1, "status": status, "reason": "no space"}
+        if status == "running":
+            del content["reason"]
+        (tmp_path / "out" / name / "status.json").write_text(json.dumps(content))
+    took = {"schema": 1, "status": "done", "seconds": 600}
+    (tmp_path / "out" / fourth / "status.json").write_text(json.dumps(took))
+    assert "1 died" in state.of_folder(tmp_path / "out").summary()[0]
+    with locks.hold(tmp_path / "out" / third):
+        found = state.of_folder(tmp_path / "out")
+        told = found.summary()
+    assert found.left == 1
+    assert told[1:] == ["about 10 min left", f"{first} and 1 more: failed: no space"]
+    assert not [line for line in told if "resuming" in line]
+
+
+def test_a_cancelled_plan_stops_and_goes_on_when_it_is_started_again(undisturbed, tmp_path):
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher", reason="needs the extra sweep")
+    out, path = tmp_path / "out", write_plan(tmp_path)
+    victims = Victims(tmp_path, path, "--folder=out", "--launcher=submitit_local", "--jobs=1")
+    try:
+        runner = victims.start()
+        while not any(len(reading.read(out / name).steps) >= 2 for name in running(out)):
+            assert runner.poll() is None, (tmp_path / "told.txt").read_text()
+            time.sleep(0.02)
+        told = list(state.cancel(out))
+        assert runner.wait(timeout=120) == 2, (tmp_path / "told.txt").read_text()
+    finally:
+        victims.end()
+    assert any(line.endswith(": stopped") for line in told)
+    assert "cancelled by styleexp-sweep cancel" in (tmp_path / "told.txt").read_text()
+    states = [reading.read(out / name).last_status for name in manifest.read(out)]
+    assert "interrupted" in states
+    assert states.count("done") < JOBS
+    assert sweep(path, "--folder", "out", cwd=tmp_path).returncode == 0
+    assert results(out) == results(undisturbed[0])
 
 
 IDLE = """\

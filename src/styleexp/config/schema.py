@@ -63,6 +63,9 @@ class Config(Settings):
     name. ``logger=tensorboard``, ``logger=mlflow`` or ``'logger=[tensorboard,mlflow]'``."""
     report: bool = True
     """Write the run's page, ``report.html``: about 3 MB and 1 s for 20 000 faces."""
+    keep_checkpoint: bool = True
+    """Keep the last checkpoints of a finished run, from which it could go on. ``false`` removes
+    them once it is done; an unfinished run has them in any case."""
     device: str = "auto"
     """``auto`` (CUDA if available and if the renderer can use it), ``cpu``, ``cuda`` or
     ``cuda:N``."""

@@ -80,8 +80,14 @@ def begin(config: Config, folder: Path, overrides: list[str]) -> int:
 
 def resume(folder: Path) -> int:
     """Resume an interrupted run from its checkpoint; return the exit code."""
-    record = reading.recorded(folder, "resume").record
+    found = reading.recorded(folder, "resume")
+    record = found.record
     config = origins.restored(record, folder, "resume", print)
+    if found.status == "done" and not config.keep_checkpoint:
+        raise UserError(
+            f"the run in '{folder}' is done and kept no checkpoint (keep_checkpoint=false): to "
+            f"repeat it, start it anew: {found.command}"
+        )
     if changed := records.changed_versions(record):
         print(f"note: the run was started with {changed}: results may differ slightly")
     with _alone(folder):
@@ -180,6 +186,8 @@ def _execute(
         loggers.finish(result, folder.path, measured, step)
         folder.check()
         folder.write_status("done", step=step, seconds=round(seconds, 1))
+        if not config.keep_checkpoint:  # not before the status: until then they are needed
+            folder.forget()
     print(f"done in {seconds:.0f} s")
     progress.print_paths(written)
     return 0

@@ -24,7 +24,7 @@ ABSENT = "not found"
 
 def essence(config: Mapping[str, Any]) -> Any:
     """A run's configuration as plain JSON, without keys that don't affect the result."""
-    aside = ("threads", "debug", "logger", "report")
+    aside = ("threads", "debug", "logger", "report", "keep_checkpoint")
     kept = {key: value for key, value in config.items() if key not in aside}
     return json.loads(json.dumps(kept, default=str))
 

@@ -31,6 +31,8 @@ JOBS = {
     "ray": "hydra.launcher.ray.init.num_cpus",
 }
 """Each launcher's key for the number of parallel jobs."""
+PACKED = ("joblib", "submitit_local", "submitit_slurm")
+"""Launchers whose tasks may have several jobs each: they start processes, which takes seconds."""
 MANY = 100
 """Jobs per batch for launchers that keep every return value, 0.2 MB with its configuration."""
 
@@ -99,6 +101,17 @@ def _check_key(hydra: Any, key: str, launcher: Sequence[str]) -> None:
                 )
             raise unknown_name(f"key of {above},", name, known)
         node, above = node[name], f"{above}.{name}"
+
+
+def check_per_task(hydra: Any, per_task: int) -> None:
+    """Raise `UserError` if the launcher's tasks can't have that many jobs."""
+    if per_task < 1:
+        raise UserError(f"--per-task {per_task} is not possible: give a number from 1.")
+    if per_task > 1 and name_of(hydra) not in PACKED:
+        raise UserError(
+            f"--per-task {per_task} is not possible with the launcher '{name_of(hydra)}': use "
+            f"--launcher {', '.join(PACKED[:-1])} or {PACKED[-1]}."
+        )
 
 
 def described(hydra: Any, tasks: int) -> list[str]:
