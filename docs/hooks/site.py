@@ -36,7 +36,7 @@ API = {
     "Parts and plugins": ("plugins", "plugins.spec", "plugins.catalogue", "plugins.loggers", "testing", "testing.renderers", "testing.losses", "testing.fields", "testing.encoders", "testing.styles", "testing.methods", "system.options", "system.errors"),
     "Runs, metrics, reports": ("runs.records", "runs.reading", "runs.finding", "runs.jobs", "runs.results", "runs.untrusted", "runs.identity", "runs.origins", "experiments.execute", "experiments.metrics", "experiments.metrics.style", "experiments.metrics.shape",
                                "experiments.metrics.truth", "experiments.reports", "experiments.reports.collect",
-                               "experiments.reports.reliability", "experiments.reports.study_results", "experiments.sweeps.claim", "experiments.sweeps.plan", "experiments.sweeps.runner", "experiments.agreement", "method.gram_cache", "experiments.bench.render", "experiments.bench.step"),
+                               "experiments.reports.reliability", "experiments.reports.study_results", "experiments.sweeps.claim", "experiments.sweeps.costs", "experiments.sweeps.plan", "experiments.sweeps.preflight", "experiments.sweeps.runner", "experiments.sweeps.state", "experiments.agreement", "method.gram_cache", "experiments.bench.render", "experiments.bench.step"),
 }  # fmt: skip
 COMMANDS = ("styleexp-assets", "styleexp-bake", "styleexp-bench", "styleexp-metrics",
             "styleexp-plugins", "styleexp-report", "styleexp-report study", "styleexp-sweep")  # fmt: skip

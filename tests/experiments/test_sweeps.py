@@ -600,7 +600,7 @@ def test_the_state_tells_the_time_left_and_each_reason_once(undisturbed, tmp_pat
     import shutil
 
     shutil.copytree(undisturbed[0], tmp_path / "out")
-    first, second, third, fourth = sorted(results(tmp_path / "out"))
+    first, second, third, fourth = manifest.read(tmp_path / "out")
     for name, status in ((first, "failed"), (second, "failed"), (third, "running")):
         content = {"schema": 1, "status": status, "reason": "no space"}
         if status == "running":
@@ -614,7 +614,6 @@ def test_the_state_tells_the_time_left_and_each_reason_once(undisturbed, tmp_pat
         told = found.summary()
     assert found.left == 1
     assert told[1:] == ["about 10 min left", f"{first} and 1 more: failed: no space"]
-    assert not [line for line in told if "resuming" in line]
 
 
 def test_a_cancelled_plan_stops_and_goes_on_when_it_is_started_again(undisturbed, tmp_path):

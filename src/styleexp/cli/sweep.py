@@ -115,6 +115,8 @@ def _run(options: argparse.Namespace) -> int:
     if launchers.name_of(hydra) != "basic" and not options.no_check:
         launchers.check_commands(hydra)
         _refuse_missing(jobs)
+    if told := launchers.note(hydra):
+        print(f"note: {told}", flush=True)
     try:
         manifest.write(folder, jobs)
         if options.retry:
@@ -193,6 +195,8 @@ def _check(
         print(f"launcher {name}: {tasks} tasks{of_each}, {at_once or 'all'} at a time")
         for line in launchers.described(hydra, tasks):
             print(line)
+        if told := launchers.note(hydra):
+            print(f"note: {told}")
     problems = preflight.missing(left)
     try:
         launchers.check_commands(hydra)

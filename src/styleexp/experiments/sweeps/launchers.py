@@ -6,6 +6,7 @@ import os
 import re
 import shlex
 import shutil
+import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -130,12 +131,29 @@ def described(hydra: Any, tasks: int) -> list[str]:
 def check_commands(hydra: Any) -> None:
     """Raise `UserError` if the launcher needs commands that this machine doesn't have."""
     if name_of(hydra) == "submitit_slurm":
-        missing = [name for name in ("sbatch", "srun", "squeue") if shutil.which(name) is None]
+        missing = [name for name in ("sbatch", "srun") if shutil.which(name) is None]
         if missing:
             raise UserError(
                 f"there is no {' and no '.join(missing)} on this machine: run this on a login "
                 "node of the cluster, or use --launcher submitit_local."
             )
+
+
+def note(hydra: Any) -> str | None:
+    """A sentence on what doesn't work as it should with the launcher here; None if all does."""
+    if name_of(hydra) != "submitit_slurm" or shutil.which("sbatch") is None:
+        return None
+    try:
+        done = subprocess.run(["sacct", "--noheader", "--jobs=1"], capture_output=True, timeout=20)
+        answers = done.returncode == 0
+    except (OSError, subprocess.TimeoutExpired):
+        answers = False
+    if answers:
+        return None
+    return (
+        "SLURM's accounting (sacct) doesn't answer here, so a task that is killed is not "
+        "noticed: if nothing runs any more, end this command and repeat it."
+    )
 
 
 def _batch_file(hydra: Any, tasks: int) -> list[str]:
