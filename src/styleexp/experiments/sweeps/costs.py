@@ -101,7 +101,8 @@ def amounts(hours: float | None, size: float | None) -> str:
     if hours is None:
         time = "unknown time"
     elif hours < 1:
-        time = f"about {60 * hours:.2g} core-minutes"
+        minutes = f"{60 * hours:.2g}"
+        time = f"about {minutes} core-minute{'' if minutes == '1' else 's'}"
     else:
         time = f"about {hours:.3g} core-hours"
     if size is None:
