@@ -488,6 +488,22 @@ def test_what_slurm_is_asked_for(tmp_path):
     ]
 
 
+def test_a_task_of_slurm_needs_more_time_than_its_warning(monkeypatch):
+    from types import SimpleNamespace as Given
+
+    def check(minutes):
+        asked = Given(_target_="SlurmLauncher", timeout_min=minutes, signal_delay_s=120)
+        launchers.check(Given(launcher=asked))
+
+    monkeypatch.setattr(launchers.shutil, "which", lambda name: name)
+    check(4)
+    with pytest.raises(UserError, match="give at least 4"):
+        check(3)
+    monkeypatch.setattr(launchers.shutil, "which", lambda name: None)
+    with pytest.raises(UserError, match="there is no sbatch and no srun"):
+        check(4)
+
+
 def slurm_lines(folder, *arguments):
     """The options in the batch file that ``--check`` shows; SLURM's commands may be missing."""
     done = sweep(
@@ -505,6 +521,7 @@ def slurm_lines(folder, *arguments):
         (["hydra.launcher.partition=gpu"], "the launcher 'basic' has no keys"),
         (["--launcher=joblib", "hydra.lancher.n_jobs=3"], "did you mean 'launcher'"),
         (["--launcher=slurm"], "did you mean 'submitit_slurm'"),
+        (["--launcher=joblib", "--per-task=0"], "--per-task 0 is not possible"),
     ],
 )
 def test_mistyped_launchers_and_their_keys_get_one_sentence(given, told, tmp_path):
@@ -537,7 +554,7 @@ def test_a_check_names_what_is_missing_once_and_runs_nothing(tmp_path):
     for told, jobs in (("'spot'", 3), ("'gravel'", 1), ("'none.png'", 1), ("'vgg19'", 1)):
         assert done.stdout.count(told) == 1
         rest = done.stdout.partition(told)[2].splitlines()
-        assert f"needed by {jobs} of 10 jobs" in rest[1]
+        assert f"stops {jobs} of 10 jobs" in rest[1]
     assert "6 jobs; left: about 6 core-minutes (plan's estimate)" in done.stdout
     assert "and 4 jobs of unknown time; disk space unknown" in done.stdout
     if have("hydra_plugins.hydra_joblib_launcher"):

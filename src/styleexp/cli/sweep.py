@@ -113,7 +113,7 @@ def _run(options: argparse.Namespace) -> int:
     if options.check:
         return _check(read, by_entry, folder, _profile(read, chosen), hydra, options.per_task)
     if launchers.name_of(hydra) != "basic" and not options.no_check:
-        launchers.check_commands(hydra)
+        launchers.check(hydra)
         _refuse_missing(jobs)
     if told := launchers.note(hydra):
         print(f"note: {told}", flush=True)
@@ -199,7 +199,7 @@ def _check(
             print(f"note: {told}")
     problems = preflight.missing(left)
     try:
-        launchers.check_commands(hydra)
+        launchers.check(hydra)
     except UserError as error:
         problems = {str(error): left} | problems
     if not problems:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import shlex
@@ -34,6 +35,8 @@ JOBS = {
 """Each launcher's key for the number of parallel jobs."""
 PACKED = ("joblib", "submitit_local", "submitit_slurm")
 """Launchers whose tasks may have several jobs each: they start processes, which takes seconds."""
+EARLY = 60
+"""Seconds by which SLURM may send a task's signal too early (``sbatch --signal``)."""
 MANY = 100
 """Jobs per batch for launchers that keep every return value, 0.2 MB with its configuration."""
 
@@ -128,15 +131,24 @@ def described(hydra: Any, tasks: int) -> list[str]:
     return []
 
 
-def check_commands(hydra: Any) -> None:
-    """Raise `UserError` if the launcher needs commands that this machine doesn't have."""
-    if name_of(hydra) == "submitit_slurm":
-        missing = [name for name in ("sbatch", "srun") if shutil.which(name) is None]
-        if missing:
-            raise UserError(
-                f"there is no {' and no '.join(missing)} on this machine: run this on a login "
-                "node of the cluster, or use --launcher submitit_local."
-            )
+def check(hydra: Any) -> None:
+    """Raise `UserError` if the launcher can't work here: SLURM's commands are missing, or tasks get
+    too little time."""
+    if name_of(hydra) != "submitit_slurm":
+        return
+    missing = [name for name in ("sbatch", "srun") if shutil.which(name) is None]
+    if missing:
+        raise UserError(
+            f"there is no {' and no '.join(missing)} on this machine: run this on a login node of "
+            "the cluster, or use --launcher submitit_local."
+        )
+    minutes, delay = float(hydra.launcher.timeout_min), float(hydra.launcher.signal_delay_s)
+    if 60 * minutes < delay + 2 * EARLY:
+        raise UserError(
+            f"hydra.launcher.timeout_min={minutes:g} leaves tasks no time to work: SLURM warns "
+            f"them signal_delay_s={delay:g} s before its end and up to {EARLY} s earlier; give at "
+            f"least {math.ceil((delay + 2 * EARLY) / 60)}, better an hour."
+        )
 
 
 def note(hydra: Any) -> str | None:

@@ -103,4 +103,4 @@ def told(problems: dict[str, list[Planned]], jobs: Sequence[Planned]) -> Iterato
     for problem, stopped in sorted(problems.items(), key=lambda item: -len(item[1])):
         entries = list(dict.fromkeys(job.entry for job in stopped))
         where = f"{', '.join(entries[:4])}{', ...' if len(entries) > 4 else ''}"
-        yield f"- {problem}\n  needed by {len(stopped)} of {len(jobs)} jobs ({where})"
+        yield f"- {problem}\n  stops {len(stopped)} of {len(jobs)} jobs ({where})"
