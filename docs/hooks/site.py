@@ -36,7 +36,7 @@ API = {
     "Parts and plugins": ("plugins", "plugins.spec", "plugins.code", "plugins.catalogue", "plugins.loggers", "testing", "testing.renderers", "testing.losses", "testing.fields", "testing.encoders", "testing.styles", "testing.methods", "system.options", "system.errors"),
     "Runs, metrics, reports": ("runs.records", "runs.reading", "runs.finding", "runs.jobs", "runs.results", "runs.untrusted", "runs.identity", "runs.origins", "runs.provenance", "experiments.execute", "experiments.reproduce", "experiments.metrics", "experiments.metrics.style", "experiments.metrics.shape",
                                "experiments.metrics.truth", "experiments.reports", "experiments.reports.collect",
-                               "experiments.reports.compare_page", "experiments.reports.reliability", "experiments.reports.study_results", "experiments.sweeps.claim", "experiments.sweeps.plan", "experiments.sweeps.runner", "experiments.agreement", "method.gram_cache", "experiments.bench.render", "experiments.bench.step"),
+                               "experiments.reports.compare_page", "experiments.reports.reliability", "experiments.reports.study_results", "experiments.sweeps.claim", "experiments.sweeps.costs", "experiments.sweeps.plan", "experiments.sweeps.preflight", "experiments.sweeps.runner", "experiments.sweeps.state", "experiments.agreement", "method.gram_cache", "experiments.bench.render", "experiments.bench.step"),
 }  # fmt: skip
 COMMANDS = ("styleexp reproduce", "styleexp-assets", "styleexp-bake", "styleexp-bench", "styleexp-metrics",
             "styleexp-plugins", "styleexp-report", "styleexp-report study", "styleexp-studio", "styleexp-sweep")  # fmt: skip

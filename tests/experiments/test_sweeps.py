@@ -12,7 +12,7 @@ from contextlib import suppress
 
 import pytest
 
-from styleexp.experiments.sweeps import launchers, manifest, plan
+from styleexp.experiments.sweeps import launchers, manifest, plan, state
 from styleexp.runs import reading
 from styleexp.runs.identity import job_key
 from styleexp.system import locks
@@ -150,7 +150,8 @@ def test_dry_run_prints_the_very_commands_and_runs_nothing(undisturbed, tmp_path
     done = sweep(write_plan(tmp_path), "--folder", "out", "--dry-run", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert not (tmp_path / "out").exists()
-    assert "# styles, Fig. 2: about 1 minutes on two cores" in done.stdout
+    assert "# styles, Fig. 2: 3 jobs; left: about 2 core-minutes (plan's estimate)" in done.stdout
+    assert "and 1 job of unknown time" in done.stdout
     commands = [line for line in done.stdout.splitlines() if line.startswith("styleexp ")]
     assert len(commands) == JOBS + 1
     assert "# the same job as above" in commands[-1]
@@ -378,7 +379,8 @@ def test_a_job_that_kills_its_process_each_time_fails_and_the_others_go_on(tmp_p
     )
     write_plan(tmp_path, text)
     plugin = {"STYLEEXP_PLUGINS": "renderer=deadly:SPEC", "PYTHONPATH": str(tmp_path)}
-    done = sweep("plan.yaml", "--launcher", "joblib", "--folder", "out", cwd=tmp_path, **plugin)
+    given = ("plan.yaml", "--launcher=joblib", "--per-task=2", "--folder=out")  # both in one task
+    done = sweep(*given, cwd=tmp_path, **plugin)
     assert done.returncode == 2, done.stderr
     assert "its process died 3 times" in done.stdout
     states = [job["state"] for job in manifest.read(tmp_path / "out").values()]
@@ -479,6 +481,178 @@ def test_what_slurm_is_asked_for(tmp_path):
         assert f"#SBATCH {line}" in asked
     assert "submitit.core._submit" in asked
     assert {job["state"] for job in manifest.read(tmp_path / "out").values()} == {"missing"}
+    told = slurm_lines(tmp_path, "--jobs=3", "hydra.launcher.partition=gpu")
+    lines = [line for line in asked.splitlines() if line.startswith("#SBATCH")]
+    assert [line for line in told if "put=" not in line and "error=" not in line] == [
+        line for line in lines if "put=" not in line and "error=" not in line
+    ]
+
+
+def test_a_task_of_slurm_needs_more_time_than_its_warning(monkeypatch):
+    from types import SimpleNamespace as Given
+
+    def check(minutes):
+        asked = Given(_target_="SlurmLauncher", timeout_min=minutes, signal_delay_s=120)
+        launchers.check(Given(launcher=asked))
+
+    monkeypatch.setattr(launchers.shutil, "which", lambda name: name)
+    check(4)
+    with pytest.raises(UserError, match="give at least 4"):
+        check(3)
+    monkeypatch.setattr(launchers.shutil, "which", lambda name: None)
+    with pytest.raises(UserError, match="there is no sbatch and no srun"):
+        check(4)
+
+
+def slurm_lines(folder, *arguments):
+    """The options in the batch file that ``--check`` shows; SLURM's commands may be missing."""
+    done = sweep(
+        "plan.yaml", "--folder=out", "--check", "--launcher=submitit_slurm", *arguments, cwd=folder
+    )
+    assert "Traceback" not in done.stderr
+    return [line.strip() for line in done.stdout.splitlines() if "#SBATCH" in line]
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (["--launcher=submitit_slurm", "hydra.launcher.partitoin=gpu"], "did you mean 'partition'"),
+        (["--launcher=submitit_slurm", "+hydra.launcher.mem=8"], "did you mean 'mem_gb'"),
+        (["hydra.launcher.partition=gpu"], "the launcher 'basic' has no keys"),
+        (["--launcher=joblib", "hydra.lancher.n_jobs=3"], "did you mean 'launcher'"),
+        (["--launcher=slurm"], "did you mean 'submitit_slurm'"),
+        (["--launcher=joblib", "--per-task=0"], "--per-task 0 is not possible"),
+    ],
+)
+def test_mistyped_launchers_and_their_keys_get_one_sentence(given, told, tmp_path):
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher", reason="needs the extra sweep")
+    done = sweep(write_plan(tmp_path), *given, cwd=tmp_path)
+    assert done.returncode == 2
+    assert told in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["plan.yaml"]
+
+
+LACKING = """\
+profile: smoke
+overrides: [encoder=vgg19_random, metrics.judge=none]
+experiments:
+  - name: meshes
+    minutes: {smoke: 3}
+    overrides: [method=robust, style=bubble, "source=torus,spot", "optim.seed=0,1,2"]
+  - name: pictures
+    pairs: [[torus, gravel], [torus, none.png]]
+  - name: weights
+    overrides: [method=robust, source=torus, style=rail, "encoder=vgg19,clip"]
+"""
+
+
+def test_a_check_names_what_is_missing_once_and_runs_nothing(tmp_path):
+    empty = {"STYLEEXP_ASSETS": "", "STYLEEXP_CACHE": str(tmp_path / "cache")}
+    done = sweep(write_plan(tmp_path, LACKING), "--folder=out", "--check", cwd=tmp_path, **empty)
+    assert done.returncode == 2, done.stderr
+    for told, jobs in (("'spot'", 3), ("'gravel'", 1), ("'none.png'", 1), ("'vgg19'", 1)):
+        assert done.stdout.count(told) == 1
+        rest = done.stdout.partition(told)[2].splitlines()
+        assert f"stops {jobs} of 10 jobs" in rest[1]
+    assert "6 jobs; left: about 6 core-minutes (plan's estimate)" in done.stdout
+    assert "and 4 jobs of unknown time; disk space unknown" in done.stdout
+    if have("hydra_plugins.hydra_joblib_launcher"):
+        refused = sweep("plan.yaml", "--folder=out", "--launcher=joblib", cwd=tmp_path, **empty)
+        assert refused.returncode == 2
+        assert "nothing was started" in refused.stderr.splitlines()[-1]
+    assert not (tmp_path / "out").exists()
+
+
+def have(module):
+    from importlib.util import find_spec
+
+    return find_spec(module.partition(".")[0]) is not None and find_spec(module) is not None
+
+
+def test_a_check_tells_the_cost_of_what_is_left_from_what_is_done(undisturbed, tmp_path):
+    import shutil
+
+    shutil.copytree(undisturbed[0], tmp_path / "out")
+    shutil.rmtree(next((tmp_path / "out" / "styles").glob("bubble-*")))
+    done = sweep(write_plan(tmp_path), "--folder=out", "--check", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "3 jobs, 2 done; left: about" in done.stdout
+    assert "MB (measured on 2 jobs)" in done.stdout
+    assert "1 job, all done" in done.stdout
+    assert "nothing is missing" in done.stdout
+
+
+def test_jobs_of_one_task_are_jobs_of_their_own(undisturbed, tmp_path):
+    """Each has its folder and its record; the one that fails doesn't take the others along."""
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher", reason="needs the extra sweep")
+    text = PLAN.replace("pairs: [[sphere", "pairs: [[none.ply, rail], [sphere")
+    arguments = ("--per-task=5", "--launcher=submitit_local", "--jobs=1", "--folder=out")
+    given = (write_plan(tmp_path, text), *arguments, "keep_checkpoint=false")
+    done = sweep(*given, "--no-check", cwd=tmp_path)
+    assert done.returncode == 2, done.stderr
+    out = tmp_path / "out"
+    assert len(list((out / ".submitit").glob("*/*_submitted.pkl"))) == 1
+    assert results(out) == results(undisturbed[0])
+    ended = [(job["state"], job["attempts"]) for job in manifest.read(out).values()]
+    assert sorted(ended) == [("done", 1)] * JOBS + [("failed", 1)]
+    assert not list(out.glob("*/*/*.safetensors"))
+    assert list(undisturbed[0].glob("*/*/*.safetensors"))
+    for name in results(out):
+        run = reading.read(out / name)
+        assert run.record["threads"] == 1
+        assert f"step {STEPS}/{STEPS}" in (out / name / "log.txt").read_text()
+    again = warm.run("-m", "styleexp", f"resume={out / name}", cwd=tmp_path)
+    assert again.returncode == 2
+    assert "kept no checkpoint" in again.stderr
+
+
+def test_tasks_of_several_jobs_are_for_launchers_that_start_processes(tmp_path):
+    done = sweep(write_plan(tmp_path), "--per-task=2", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "--per-task 2 is not possible with the launcher 'basic'" in done.stderr
+
+
+def test_the_state_tells_the_time_left_and_each_reason_once(undisturbed, tmp_path):
+    import shutil
+
+    shutil.copytree(undisturbed[0], tmp_path / "out")
+    first, second, third, fourth = manifest.read(tmp_path / "out")
+    for name, status in ((first, "failed"), (second, "failed"), (third, "running")):
+        content = {"schema": 1, "status": status, "reason": "no space"}
+        if status == "running":
+            del content["reason"]
+        (tmp_path / "out" / name / "status.json").write_text(json.dumps(content))
+    took = {"schema": 1, "status": "done", "seconds": 600}
+    (tmp_path / "out" / fourth / "status.json").write_text(json.dumps(took))
+    assert "1 died" in state.of_folder(tmp_path / "out").summary()[0]
+    with locks.hold(tmp_path / "out" / third):
+        found = state.of_folder(tmp_path / "out")
+        told = found.summary()
+    assert found.left == 1
+    assert told[1:] == ["about 10 min left", f"{first} and 1 more: failed: no space"]
+
+
+def test_a_cancelled_plan_stops_and_goes_on_when_it_is_started_again(undisturbed, tmp_path):
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher", reason="needs the extra sweep")
+    out, path = tmp_path / "out", write_plan(tmp_path)
+    victims = Victims(tmp_path, path, "--folder=out", "--launcher=submitit_local", "--jobs=1")
+    try:
+        runner = victims.start()
+        while not any(len(reading.read(out / name).steps) >= 2 for name in running(out)):
+            assert runner.poll() is None, (tmp_path / "told.txt").read_text()
+            time.sleep(0.02)
+        told = list(state.cancel(out))
+        assert runner.wait(timeout=120) == 2, (tmp_path / "told.txt").read_text()
+    finally:
+        victims.end()
+    assert any(line.endswith(": stopped") for line in told)
+    assert "cancelled by styleexp-sweep cancel" in (tmp_path / "told.txt").read_text()
+    states = [reading.read(out / name).last_status for name in manifest.read(out)]
+    assert "interrupted" in states
+    assert states.count("done") < JOBS
+    assert sweep(path, "--folder", "out", cwd=tmp_path).returncode == 0
+    assert results(out) == results(undisturbed[0])
 
 
 IDLE = """\

@@ -93,7 +93,8 @@ JUDGE_HELP = "encoder used for judging (default: one that the run did not train 
 
 
 def _judge(options: argparse.Namespace, trained: str | None = None) -> Judge | None:
-    from styleexp.experiments.metrics import judge_name, load_judge
+    from styleexp.encoders.options import judge_name
+    from styleexp.experiments.metrics import load_judge
 
     if options.windows < 1:
         raise UserError(f"--windows {options.windows}: give 1 or more.")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections import Counter
-from collections.abc import Sequence
+import time
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from styleexp.system import gpus
 from styleexp.system.errors import UserError
@@ -21,15 +21,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0 if all jobs are done, else 2, also after a user error."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     gpus.remember()
-    commands = {"status": _status, "collect": _collect}
+    commands = {"status": _status, "cancel": _cancel, "collect": _collect}
     try:
         if given and given[0] in commands:
             parser = argparse.ArgumentParser(prog=f"styleexp-sweep {given[0]}")
             parser.add_argument("folder", type=Path)
-            folder = parser.parse_args(given[1:]).folder
-            if not folder.is_dir():
-                raise UserError(f"there is no folder '{folder}'.")
-            return commands[given[0]](folder)
+            if given[0] == "status":
+                parser.add_argument("--watch", type=float, nargs="?", const=10.0, metavar="SECONDS",
+                                    help="repeat the summary until all jobs have ended; default: "
+                                    "every 10 seconds")  # fmt: skip
+            options = parser.parse_args(given[1:])
+            if not options.folder.is_dir():
+                raise UserError(f"there is no folder '{options.folder}'.")
+            return commands[given[0]](options)
         return _run(_parser().parse_intermixed_args(given))
     except UserError as error:
         print(f"styleexp-sweep: {error}", file=sys.stderr)
@@ -44,8 +48,9 @@ def _parser() -> argparse.ArgumentParser:
         prog="styleexp-sweep",
         description="Run or continue a plan of experiments: finished jobs are skipped, killed "
         "jobs are resumed. Any number of runners may share a folder.",
-        epilog="styleexp-sweep status FOLDER shows every job; styleexp-sweep collect FOLDER writes "
-        "runs.csv and runs.parquet.",
+        epilog="styleexp-sweep status FOLDER shows the jobs, with --watch again and again; "
+        "styleexp-sweep cancel FOLDER stops them; styleexp-sweep collect FOLDER writes runs.csv "
+        "and runs.parquet.",
     )
     parser.add_argument("plan", type=Path, metavar="PLAN", help="a plan file, see sweeps/")
     parser.add_argument(
@@ -57,7 +62,14 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--launcher", metavar="NAME", help="basic, joblib, submitit_local, "
                         "submitit_slurm or ray; default: the plan's")  # fmt: skip
     parser.add_argument("--jobs", type=int, metavar="N", help="run N jobs in parallel")
+    parser.add_argument("--per-task", type=int, default=1, metavar="N", help="run N jobs one after "
+                        "the other in each of the launcher's processes, which start "
+                        "once")  # fmt: skip
     parser.add_argument("--retry", action="store_true", help="run failed jobs again")
+    parser.add_argument("--check", action="store_true", help="say what is missing, how the jobs "
+                        "would be started and what they cost; run nothing")  # fmt: skip
+    parser.add_argument("--no-check", action="store_true", help="start although something is "
+                        "missing: the jobs that need it fail")  # fmt: skip
     parser.add_argument("--dry-run", action="store_true", help="print the commands, run nothing")
     return parser
 
@@ -81,23 +93,36 @@ def _run(options: argparse.Namespace) -> int:
         print(f"note: relative paths refer to '{home}', where this plan was started.", flush=True)
         options.plan, folder = options.plan.absolute(), folder.absolute()
         os.chdir(home)
-    own = [each for each in options.overrides if each.startswith("hydra.")]
+    own = [each for each in options.overrides if each.lstrip("+~").startswith("hydra.")]
     launcher = launchers.overrides(options.launcher or read.launcher, options.jobs) + own
-    chosen = [each for each in options.overrides if not each.startswith("hydra.")]
+    chosen = [each for each in options.overrides if each not in own]
+    try:
+        with launchers.composed(folder, launcher) as (_, config):
+            hydra = config.hydra
+            launchers.check_per_task(hydra, options.per_task)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(explain(error)) from error
     try:
         by_entry = plan.jobs(read, folder, chosen)
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(f"{options.plan}: {explain(error)}") from error
     jobs = list({job.name: job for listed in by_entry.values() for job in listed}.values())
     if options.dry_run:
-        _show_commands(read, by_entry, chosen)
+        _show_commands(read, by_entry, _profile(read, chosen))
         return 0
+    if options.check:
+        return _check(read, by_entry, folder, _profile(read, chosen), hydra, options.per_task)
+    if launchers.name_of(hydra) != "basic" and not options.no_check:
+        launchers.check(hydra)
+        _refuse_missing(jobs)
+    if told := launchers.note(hydra):
+        print(f"note: {told}", flush=True)
     try:
         manifest.write(folder, jobs)
         if options.retry:
             runner.retry(jobs)
         print(f"{len(jobs)} jobs, {folder}", flush=True)
-        runner.run(jobs, folder, launcher)
+        runner.run(jobs, folder, launcher, options.per_task)
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(explain(error)) from error
     except OSError as error:
@@ -119,77 +144,116 @@ def _report(read: Plan, by_entry: dict[str, list[Planned]], folder: Path) -> int
     return 0 if set(states) == {"done"} else 2
 
 
-def _show_commands(
-    read: Plan, by_entry: dict[str, list[Planned]], overrides: Sequence[str]
-) -> None:
-    """Print the commands, with each experiment's figure and cost, and mark finished jobs."""
+def _profile(read: Plan, overrides: Sequence[str]) -> str:
+    given = [o.removeprefix("profile=") for o in overrides if o.startswith("profile=")]
+    return given[-1] if given else read.profile
+
+
+def _unfinished(jobs: Iterable[Planned]) -> list[Planned]:
     from styleexp.runs import reading
 
-    given = [o.removeprefix("profile=") for o in overrides if o.startswith("profile=")]
-    profile = given[-1] if given else read.profile
-    total, seen = 0.0, set()
+    return [job for job in jobs if reading.of_job(job).status != "done"]
+
+
+def _refuse_missing(jobs: Sequence[Planned]) -> None:
+    """Raise `UserError` if something is missing that unfinished jobs need."""
+    from styleexp.experiments.sweeps import preflight
+
+    left = _unfinished(jobs)
+    if problems := preflight.missing(left):
+        print(*preflight.told(problems, left), sep="\n", file=sys.stderr)
+        count = len({job.name for stopped in problems.values() for job in stopped})
+        raise UserError(
+            f"{count} of {len(left)} jobs can't run; nothing was started: see above, or start "
+            "the others with --no-check."
+        )
+
+
+def _check(
+    read: Plan,
+    by_entry: dict[str, list[Planned]],
+    folder: Path,
+    profile: str,
+    hydra: Any,
+    per_task: int,
+) -> int:
+    """Print what is missing, how jobs are started and what they cost; return the exit code."""
+    from styleexp.experiments.sweeps import costs, launchers, preflight
+
+    jobs = list({job.name: job for listed in by_entry.values() for job in listed}.values())
+    left = _unfinished(jobs)
+    print(f"{len(jobs)} jobs, {len(jobs) - len(left)} done, in {folder} (profile={profile})")
+    found = costs.of_plan(read, by_entry, profile)
+    width = max(map(len, found))
+    for name, cost in found.items():
+        print(f"  {name:<{width}}  {cost.words()}")
+    if left:
+        print(f"left in all: {costs.total(found)}")
+        name, at_once = launchers.name_of(hydra), launchers.at_once(hydra)
+        tasks = -(-len(left) // per_task)
+        of_each = f" of up to {per_task} jobs" if per_task > 1 else ""
+        print(f"launcher {name}: {tasks} tasks{of_each}, {at_once or 'all'} at a time")
+        for line in launchers.described(hydra, tasks):
+            print(line)
+        if told := launchers.note(hydra):
+            print(f"note: {told}")
+    problems = preflight.missing(left)
+    try:
+        launchers.check(hydra)
+    except UserError as error:
+        problems = {str(error): left} | problems
+    if not problems:
+        print("nothing is missing.")
+        return 0
+    print("missing or wrong:")
+    print(*preflight.told(problems, left), sep="\n")
+    return 2
+
+
+def _show_commands(read: Plan, by_entry: dict[str, list[Planned]], profile: str) -> None:
+    """Print the commands, with each experiment's figure and cost, and mark finished jobs."""
+    from styleexp.experiments.sweeps import costs
+    from styleexp.runs import reading
+
+    found, seen = costs.of_plan(read, by_entry, profile), set()
     for entry in read.experiments:
         assert entry.name is not None
-        minutes = entry.minutes.get(profile)
-        cost = "unknown cost" if minutes is None else f"about {minutes:g} minutes on two cores"
-        total += minutes or 0
-        print(f"# {entry.name}{f', {entry.figure}' if entry.figure else ''}: {cost}")
+        figure = f", {entry.figure}" if entry.figure else ""
+        print(f"# {entry.name}{figure}: {found[entry.name].words()}")
         for job in by_entry[entry.name]:
             status = reading.of_job(job).status
             note = "" if status == "missing" else f"  # {status}"
             note = "  # the same job as above" if job.name in seen else note
             seen.add(job.name)
             print(job.command() + note)
-    print(f"# {len(seen)} jobs, about {total:g} minutes on two cores (profile={profile})")
+    print(f"# {len(seen)} jobs, left: {costs.total(found)} (profile={profile})")
 
 
-def _status(folder: Path) -> int:
-    from rich.console import Console
-    from rich.table import Table
+def _status(options: argparse.Namespace) -> int:
+    from styleexp.experiments.sweeps import state
 
-    from styleexp.experiments.sweeps import manifest
-    from styleexp.runs import reading
-    from styleexp.runs.jobs import Job
+    while True:
+        found = state.of_folder(options.folder)
+        print(*(found.summary() if options.watch else found.lines()), sep="\n", flush=True)
+        if not options.watch or not found.left:
+            return 0
+        time.sleep(options.watch)
+        print()
 
-    jobs = manifest.read(folder)
-    if not jobs:
-        raise UserError(f"'{folder}' is not a plan's folder: it has no {manifest.NAME}.")
-    table = Table(title=str(folder))
-    for column in ("job", "state", "step", "attempts", "time"):
-        table.add_column(column, overflow="fold")
-    counts: Counter[str] = Counter()
-    reasons: list[str] = []
-    for name, known in jobs.items():
-        job = Job(name, tuple(known.get("overrides", ())), folder / name, known.get("key"))
-        run = reading.of_job(job)
-        if run.remark:
-            reasons.append(f"{name}: {run.remark}")
-        state = "outdated" if known["state"] == "outdated" else run.status
-        state = "waiting" if state == "missing" else state
-        counts[state] += 1
-        taken, total = len(run.steps), run.config.get("optim.steps")
-        table.add_row(
-            name,
-            state,
-            f"{taken}/{total}" if taken and total else "",
-            str(known.get("attempts", 0)),
-            f"{run.seconds:.0f} s" if run.seconds is not None else "",
-        )
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=140)
-    console.print(table)
-    console.print(", ".join(f"{count} {state}" for state, count in counts.items()))
-    for reason in reasons:
-        console.print(reason, markup=False, soft_wrap=True)
+
+def _cancel(options: argparse.Namespace) -> int:
+    from styleexp.experiments.sweeps import state
+
+    for line in state.cancel(options.folder):
+        print(line)
     return 0
 
 
-def _collect(folder: Path) -> int:
+def _collect(options: argparse.Namespace) -> int:
     from styleexp.experiments.reports.collect import collect, write
 
-    runs = collect(folder)
-    for path in write(runs, folder):
+    runs = collect(options.folder)
+    for path in write(runs, options.folder):
         print(path)
     print(", ".join(f"{count} {status}" for status, count in runs["status"].value_counts().items()))
     return 0

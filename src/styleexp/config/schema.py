@@ -66,6 +66,9 @@ class Config(Settings):
     formats: list[str] = option(factory=list, choices=("stl", "3mf"))
     """Formats in which the result is written besides PLY, OBJ and GLB: ``formats=[stl,3mf]``, for
     printing."""
+    keep_checkpoint: bool = True
+    """Keep the last checkpoints of a finished run, from which it could go on. ``false`` removes
+    them once it is done; an unfinished run has them in any case."""
     device: str = "auto"
     """``auto`` (CUDA if available and if the renderer can use it), ``cpu``, ``cuda`` or
     ``cuda:N``."""

@@ -69,13 +69,18 @@ def check(config: Config) -> None:
     Reads no files and imports nothing heavy, so that a mistyped name is reported at once.
     """
     for kind, part in parts(config).items():
-        path = locate(kind, part.name, part.path)
-        if path is None:
-            continue
-        if not path.exists():
-            where = "" if path.is_absolute() else f" in '{Path.cwd()}'"
-            raise UserError(f"the {kind} '{path}' does not exist{where}: check its name.")
-        _check_suffix(kind, path)
+        check_part(kind, part)
+
+
+def check_part(kind: str, part: Named) -> None:
+    """`check` one of the configuration's `parts`."""
+    path = locate(kind, part.name, part.path)
+    if path is None:
+        return
+    if not path.exists():
+        where = "" if path.is_absolute() else f" in '{Path.cwd()}'"
+        raise UserError(f"the {kind} '{path}' does not exist{where}: check its name.")
+    _check_suffix(kind, path)
 
 
 def parts(config: Config) -> dict[str, Named]:

@@ -29,3 +29,11 @@ class ClipConfig(EncoderConfig):
     name: str = "clip"
     weights: str | None = None
     """A folder with a CLIP model in transformers' format; nothing is downloaded."""
+
+
+def judge_name(name: str, trained: str | None) -> str | None:
+    """Resolve ``auto`` to an encoder other than ``trained``, the run's own, and ``none`` to
+    None."""
+    if name == "auto":
+        return "vgg16" if trained == "vgg16_edges" else "vgg16_edges"
+    return None if name == "none" else name

@@ -14,6 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from styleexp.encoders.options import judge_name
 from styleexp.experiments import endings, progress
 from styleexp.experiments.sweeps.claim import PATIENCE, busy
 from styleexp.runs import identity, origins, reading, records
@@ -93,8 +94,14 @@ def begin(
 
 def resume(folder: Path) -> int:
     """Resume an interrupted run from its checkpoint; return the exit code."""
-    record = reading.recorded(folder, "resume").record
+    found = reading.recorded(folder, "resume")
+    record = found.record
     config = origins.restored(record, folder, "resume", print)
+    if found.status == "done" and not config.keep_checkpoint:
+        raise UserError(
+            f"the run in '{folder}' is done and kept no checkpoint (keep_checkpoint=false): to "
+            f"repeat it, start it anew: {found.command}"
+        )
     with _alone(folder):
         return _guarded(config, records.RunFolder(folder), record, resumed=True)
 
@@ -196,6 +203,8 @@ def _execute(
         loggers.finish(result, folder.path, measured, step)
         folder.check()
         folder.write_status("done", step=step, seconds=round(seconds, 1))
+        if not config.keep_checkpoint:  # not before the status: until then they are needed
+            folder.forget()
     print(f"done in {seconds:.0f} s")
     progress.print_paths(written)
     return 0
@@ -366,6 +375,4 @@ def _measure(result: Result, config: Config) -> dict[str, float]:
 
 def _judge_name(config: Config) -> str | None:
     """The encoder that measures the result; None if it isn't measured with one."""
-    from styleexp.experiments import metrics
-
-    return metrics.judge_name(config.metrics.judge, config.encoder.name)
+    return judge_name(config.metrics.judge, config.encoder.name)

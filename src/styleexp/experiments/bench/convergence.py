@@ -50,9 +50,10 @@ def run(config: Config, points: int) -> list[Point]:
     """Run once and measure before the first step and at ``points`` steps, denser at the
     beginning."""
     from styleexp.config import build
+    from styleexp.encoders.options import judge_name
     from styleexp.experiments import metrics
 
-    name = metrics.judge_name(config.metrics.judge, config.encoder.name)
+    name = judge_name(config.metrics.judge, config.encoder.name)
     judge = metrics.load_judge(name, config.metrics.windows)
     if judge is None:
         raise UserError("metrics.judge=none leaves out the style distance: name an encoder.")

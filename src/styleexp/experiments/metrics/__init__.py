@@ -64,14 +64,6 @@ class Judge:
         return self.styles[key]
 
 
-def judge_name(name: str, trained: str | None) -> str | None:
-    """Resolve ``auto`` to an encoder other than ``trained``, the run's own, and ``none`` to
-    None."""
-    if name == "auto":
-        return "vgg16" if trained == "vgg16_edges" else "vgg16_edges"
-    return None if name == "none" else name
-
-
 def load_judge(name: str | None, windows: int, device: str | torch.device = "cpu") -> Judge | None:
     """Load the judge of that name onto the device; downloads its weights if needed."""
     from styleexp.plugins import load_encoder

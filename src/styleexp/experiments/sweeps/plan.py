@@ -24,13 +24,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import field as option
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from styleexp.config.overrides import literal, quote, understood
 from styleexp.experiments.sweeps.settings import product, varying
 from styleexp.runs.identity import job_key
 from styleexp.runs.jobs import Job
 from styleexp.system.errors import UserError, unknown_name
+
+if TYPE_CHECKING:
+    from styleexp.config.schema import Config
 
 
 @dataclass
@@ -67,6 +70,7 @@ class Planned(Job):
     """A job of a plan. ``name`` is its folder below the plan's."""
 
     entry: str = ""
+    config: Config | None = option(default=None, compare=False, repr=False)
 
     def command(self) -> str:
         """The equivalent command."""
@@ -154,20 +158,22 @@ def jobs(plan: Plan, folder: Path, overrides: Sequence[str] = ()) -> dict[str, l
     import hydra
 
     from styleexp.config import compose
+    from styleexp.config.many import Composer
 
     compose.register()
     found: dict[str, list[Planned]] = {}
     first: dict[str, Planned] = {}
     with hydra.initialize_config_module("styleexp.conf", version_base="1.3"):
+        composer = Composer()
         for entry in plan.experiments:
             assert entry.name is not None
             listed = [each for part in _parts(plan, entry, overrides) for each in part]
             made = []
             for each, settings in zip(listed, varying(listed), strict=True):
-                config = compose.typed(hydra.compose("config", [*each, "hydra.mode=RUN"]))
+                config = composer.compose([*each, "hydra.mode=RUN"])
                 key = job_key(config)
                 name = f"{entry.name}/{_readable(settings)}-{key[:8]}"
-                job = Planned(name, tuple(each), folder / name, key, entry.name)
+                job = Planned(name, tuple(each), folder / name, key, entry.name, config)
                 shared = first.setdefault(key, job)
                 made.append(dataclasses.replace(job, name=shared.name, folder=shared.folder))
             found[entry.name] = made
@@ -178,10 +184,10 @@ def _parts(plan: Plan, entry: Entry, overrides: Sequence[str]) -> Iterator[list[
     base = [f"+experiment={entry.experiment}"] if entry.experiment else []
     base += [f"profile={plan.profile}"]
     base += understood([*plan.overrides, *entry.overrides, *overrides], multirun=True)
+    params = _params(base)  # what a pair chooses doesn't change them
     for pair in entry.pairs or [[]]:
         chosen = [f"{k}={v}" for k, v in zip(("source", "style"), pair, strict=False)]
         given = [*base, *understood(chosen)]
-        params = _params(given)
         seeds = entry.seeds if entry.seeds is not None else plan.seeds
         if seeds and (entry.seeds is not None or "optim.seed" not in params):
             given.append(f"optim.seed={','.join(map(str, seeds))}")

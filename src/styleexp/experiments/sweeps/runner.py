@@ -13,7 +13,7 @@ import threading
 import time
 import traceback
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from functools import cache
 from pathlib import Path
@@ -29,27 +29,38 @@ from styleexp.system.errors import UserError
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
+    from styleexp.config.schema import Config
     from styleexp.experiments.sweeps.plan import Planned
 
 LOG = "log.txt"
 """File in a job's folder with its output."""
+CANCELLED = "cancelled"
+"""File in a plan's folder after which no job is started, until the plan is."""
 MOST_DEATHS = 3
 """Number of times a job's process may die while running alone before the job counts as failed."""
 AT_WORK = threading.Lock()
 """Held by this process while it runs a job."""
+NAMES, THREADS = "STYLEEXP_JOBS", "STYLEEXP_THREADS"
+"""Keys of ``hydra.job.env_set`` that tell a task its jobs' names and their number of threads."""
+SEPARATOR = ":"
+"""Between names; a job's name has none."""
 POLL = 1.0
 """Seconds between polls of jobs that other runners execute."""
 
 
-def run(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> None:
+def run(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str], per_task: int = 1) -> None:
     """Run all jobs that are neither done nor failed, and wait for those of other runners.
 
-    ``launcher`` are overrides of Hydra's own configuration, including ``launcher=...``. Raises
-    `UserError` if the launcher itself fails before any job started.
+    ``launcher`` are overrides of Hydra's own configuration, including ``launcher=...``; each of its
+    tasks runs up to ``per_task`` jobs, one after the other in one process. Raises `UserError` if
+    the launcher itself fails before any job started.
     """
+    (folder / CANCELLED).unlink(missing_ok=True)
     deaths: Counter[str] = Counter()
     suspects: set[str] = set()
     while True:
+        if (folder / CANCELLED).exists():
+            raise UserError("cancelled by styleexp-sweep cancel; repeat the command to continue.")
         if not (folder / manifest.NAME).exists():  # the folder was removed meanwhile
             manifest.write(folder, jobs)
         states = {}
@@ -69,7 +80,7 @@ def run(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> None:
         # A dying worker may kill the others: retry dead jobs one at a time.
         batch = [job for job in waiting if job.name not in suspects] or waiting[:1]
         before = _progress(folder, batch)
-        error = _launch(batch, folder, launcher)
+        error = _launch(batch, folder, launcher, per_task)
         after = {job.name: reading.of_job(job).status for job in batch}
         died = [name for name, state in after.items() if state == "died"]
         if error is not None and not set(after.values()) & set(manifest.ENDED):
@@ -80,7 +91,7 @@ def run(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> None:
         suspects.update(died)
         if error is None:
             continue
-        if _progress(folder, batch) == before:
+        if _progress(folder, batch) == before and not (folder / CANCELLED).exists():
             raise UserError(
                 f"the launcher failed before any job started ({records.first_line(error)}): see "
                 f"{folder} or try --launcher basic."
@@ -111,49 +122,59 @@ def _progress(folder: Path, jobs: Sequence[Planned]) -> list[Any]:
     return [known.get(job.name, {}).get("attempts") for job in jobs]
 
 
-def _launch(jobs: Sequence[Planned], folder: Path, launcher: Sequence[str]) -> Exception | None:
+def _launch(
+    jobs: Sequence[Planned], folder: Path, launcher: Sequence[str], per_task: int
+) -> Exception | None:
     """Run the jobs with Hydra's launcher; return the exception that it raised or that killed a
     job."""
-    import hydra
     from hydra._internal.callbacks import Callbacks
-    from hydra.core.global_hydra import GlobalHydra
     from hydra.core.plugins import Plugins
     from hydra.core.utils import JobStatus
-    from hydra.types import HydraContext, RunMode
+    from hydra.types import HydraContext
 
-    with hydra.initialize_config_module("styleexp.conf", version_base="1.3"):
-        composed: Any = GlobalHydra.instance().hydra
-        config = composed.compose_config(
-            "config",
-            [f"hydra.sweep.dir={quote(str(folder))}", *launcher],
-            run_mode=RunMode.MULTIRUN,
-            from_shell=False,
-        )
+    with launchers.composed(folder, launcher) as (loader, config):
         started = Plugins.instance().instantiate_launcher(
-            hydra_context=HydraContext(composed.config_loader, Callbacks()),
-            task_function=task,
+            hydra_context=HydraContext(loader, Callbacks()),
+            task_function=task if per_task == 1 else pack,
             config=config,
         )
         threads = launchers.threads_each(config.hydra)
-        # Hydra composes every job with the launcher's own overrides, which need the launcher.
+        # Hydra composes every task with the launcher's own overrides, which need the launcher.
         chosen = [each for each in launcher if each.startswith("launcher=")]
-        given = []
-        for job in jobs:
-            more = [*chosen, f"hydra.sweep.subdir={quote(job.name)}"]
-            if not any(each.startswith("threads=") for each in job.overrides):
-                more.append(f"threads={threads}")
-            given.append([*job.overrides, *more])
-        size = launchers.batch_size(config.hydra) or len(jobs)
-        for at in range(0, len(jobs), size):
+        tasks = [jobs[at : at + per_task] for at in range(0, len(jobs), per_task)]
+        if per_task == 1:
+            given = [[*_overrides(job, threads), *chosen, _subfolder(job)] for job in jobs]
+        else:
+            given = [[*chosen, *_packed(each, threads)] for each in tasks]
+        size = launchers.batch_size(config.hydra) or len(tasks)
+        for at in range(0, len(tasks), size):
             try:
                 returned = started.launch(given[at : at + size], initial_job_idx=at)
             except Exception as error:
-                _settle(jobs[at : at + size])
+                _settle([job for each in tasks[at : at + size] for job in each])
                 return error
             for each in returned:
                 if each.status == JobStatus.FAILED:
                     return each._return_value
     return None
+
+
+def _overrides(job: Job, threads: int) -> list[str]:
+    """The job's overrides, with its number of threads unless it has one."""
+    given = any(each.startswith("threads=") for each in job.overrides)
+    return [*job.overrides, *([] if given else [f"threads={threads}"])]
+
+
+def _subfolder(job: Job) -> str:
+    return f"hydra.sweep.subdir={quote(job.name)}"
+
+
+def _packed(jobs: Sequence[Job], threads: int) -> list[str]:
+    """Overrides of a task for `pack`. Its jobs' own are in the manifest."""
+    names = {NAMES: SEPARATOR.join(job.name for job in jobs), THREADS: str(threads)}
+    passed = [f"+hydra.job.env_set.{key}={quote(value)}" for key, value in names.items()]
+    # Hydra's folder of the task is that of its first job, without Hydra's files about the task.
+    return [*passed, _subfolder(jobs[0]), "hydra.output_subdir=null"]
 
 
 def _settle(jobs: Sequence[Planned]) -> None:
@@ -163,33 +184,66 @@ def _settle(jobs: Sequence[Planned]) -> None:
 
 
 def task(config: DictConfig) -> None:
-    """Job function for the launcher, possibly called in another process.
-
-    Skips jobs that another runner executes or has finished meanwhile. Never raises if the job
-    fails.
-    """
-    from contextlib import chdir
-
+    """Job function for the launcher, possibly called in another process: one job."""
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import OmegaConf
 
     from styleexp.config import compose
 
-    _end_with_runner()
     runtime = HydraConfig.get()
     root, folder = Path(runtime.sweep.dir), Path(runtime.runtime.output_dir)
     name = str(runtime.sweep.subdir)
     # Keep Hydra's grammar: resolving would lose an escaped "${" in a file's name.
     given: Any = OmegaConf.to_container(runtime.overrides.task, resolve=False)
     compose.register()
+    # No key: the manifest was removed; the runner rewrites it.
+    key = manifest.read(root).get(name, {}).get("key")
+    _attempt(Job(name, tuple(given), folder, key), root, lambda: compose.typed(config))
+
+
+def pack(config: DictConfig) -> None:
+    """Job function for the launcher, possibly called in another process: several jobs.
+
+    Their overrides are those of the manifest; a job that it no longer has isn't run. What a job
+    raises is in its record, and the next one runs.
+    """
+    import copy
+
+    from hydra.core.hydra_config import HydraConfig
+
+    from styleexp.config import compose, many
+
+    runtime = HydraConfig.get()
+    root, passed = Path(runtime.sweep.dir), runtime.job.env_set
+    compose.register()
+    composer = many.Composer()  # the launcher has brought the runner's Hydra along
+    for name in passed[NAMES].split(SEPARATOR):
+        known = manifest.read(root).get(name)
+        if known is None:
+            continue
+        given = _overrides(Job(name, tuple(known["overrides"]), root / name), int(passed[THREADS]))
+
+        def composed(given: list[str] = given) -> Config:
+            return copy.deepcopy(composer.compose([*given, "hydra.mode=RUN"]))
+
+        _attempt(Job(name, tuple(given), root / name, known["key"]), root, composed)
+
+
+def _attempt(job: Job, root: Path, composed: Callable[[], Config]) -> None:
+    """Run a job, unless another runner executes it or it has ended meanwhile. Never raises if the
+    job fails."""
+    from contextlib import chdir
+
+    from hydra.core.hydra_config import HydraConfig
+
+    _end_with_runner()
     try:
-        with AT_WORK, locks.hold(folder), chdir(runtime.runtime.cwd):  # see hydra.job.chdir
-            # No key: the manifest was removed; the runner rewrites it.
-            key = manifest.read(root).get(name, {}).get("key")
-            job = Job(name, tuple(given), folder, key)
-            state = reading.of_job(job).status if key else reading.read(folder).last_status
+        with AT_WORK, locks.hold(job.folder), chdir(HydraConfig.get().runtime.cwd):
+            if (root / CANCELLED).exists():
+                return
+            state = reading.of_job(job).status if job.key else reading.read(job.folder).last_status
             if state not in (*manifest.ENDED, "other"):  # the runner rejects another run's folder
-                _work(config, root, job)
+                _work(composed, root, job)
     except locks.Busy:
         return
 
@@ -210,11 +264,10 @@ def _end_with_runner() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _work(config: DictConfig, root: Path, job: Job) -> None:
+def _work(composed: Callable[[], Config], root: Path, job: Job) -> None:
     """Run a job whose lock is held, with its output redirected to its log."""
     from hydra.core.hydra_config import HydraConfig
 
-    from styleexp.config import compose
     from styleexp.experiments.execute import begin
 
     name, folder = job.name, job.folder
@@ -228,7 +281,7 @@ def _work(config: DictConfig, root: Path, job: Job) -> None:
     ):
         try:
             asked = [each for each in job.overrides if not each.startswith("launcher=")]
-            typed = compose.typed(config)
+            typed = composed()
             if job.key not in (None, identity.job_key(typed)):
                 raise UserError(
                     "its source or style file, or the code of a plugin, has changed since the plan "
