@@ -145,7 +145,7 @@ def _job(config: DictConfig) -> float | None:
     from styleexp.system.errors import UserError
 
     runtime = HydraConfig.get()
-    in_search = objective.LEAST_IOU in os.environ
+    in_search = objective.LEAST_CRAFT in os.environ
     numbered = not OmegaConf.is_missing(runtime.job, "num")
     in_sweep = numbered and not in_search
     compose.register()  # not done yet in a launcher's process

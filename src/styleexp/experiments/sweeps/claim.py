@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
     from styleexp.config.schema import Config
 
+LIMITS = ("n_trials", "max_failure_rate")
+"""Settings of a search that don't change its trials, but when it ends."""
 PATIENCE = 2.0
 """Seconds to wait for a folder, because checking whether it is held locks it briefly."""
 
@@ -154,15 +156,14 @@ def _given(config: DictConfig) -> list[str]:
 
 
 def _search(config: DictConfig) -> dict[str, Any]:
-    """Description of a search, whose jobs aren't known in advance."""
+    """Description of a search, whose jobs aren't known in advance. Another number of trials is the
+    same search, going on: a seeded sampler proposes the same first ones, which are done."""
     from omegaconf import OmegaConf
 
-    return {
-        "overrides": _given(config),
-        "sweeper": json.loads(
-            json.dumps(OmegaConf.to_container(config.hydra.sweeper, resolve=True), default=str)
-        ),
-    }
+    sweeper = OmegaConf.to_container(config.hydra.sweeper, resolve=True)
+    assert isinstance(sweeper, dict)
+    kept = {key: value for key, value in sweeper.items() if key not in LIMITS}
+    return {"overrides": _given(config), "sweeper": json.loads(json.dumps(kept, default=str))}
 
 
 def _refuse_others(

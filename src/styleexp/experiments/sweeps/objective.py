@@ -8,26 +8,26 @@ from pathlib import Path
 from styleexp.runs import reading
 from styleexp.system.errors import UserError
 
-LEAST_IOU = "STYLEEXP_LEAST_IOU"
-"""Environment variable with the IoU constraint; ``conf/search`` sets it for each job."""
-PENALTY = 10.0
-"""Penalty per unit of missing IoU: 0.1 too little counts as much as gaining no style at all, since
-the style distance is relative to the source's."""
+LEAST_CRAFT = "STYLEEXP_LEAST_CRAFT"
+"""Environment variable with the craft that a result has to keep; ``conf/search`` sets it for each
+job."""
+PENALTY = 2.0
+"""Match that a point of missing craft costs."""
 
 
 def objective(folder: Path) -> float:
-    """Held-out style distance of a finished run, with a penalty if the outline moved too far.
+    """Estimated match of a finished run, from 1 to 5, less a penalty for missing craft: the two
+    measures that were chosen by raters (`experiments.ratings`).
 
-    Reads ``style_distance`` and ``silhouette_iou`` from the run's ``metrics.json``; raises
-    `UserError` if they are missing.
+    Reads ``match`` and ``craft`` from the run's ``metrics.json``; raises `UserError` if they are
+    missing.
     """
     run = reading.read(folder)
-    least = float(os.environ[LEAST_IOU])
-    missing = [name for name in ("style_distance", "silhouette_iou") if name not in run.metrics]
+    least = float(os.environ[LEAST_CRAFT])
+    missing = [name for name in ("match", "craft") if name not in run.metrics]
     if missing:
         raise UserError(
-            f"a search needs style_distance and silhouette_iou in '{folder / 'metrics.json'}', but "
+            f"a search needs match and craft in '{folder / 'metrics.json'}', but "
             f"{' and '.join(missing)} can't be read."
         )
-    distance, iou = run.metrics["style_distance"], run.metrics["silhouette_iou"]
-    return distance + PENALTY * max(0.0, least - iou)
+    return run.metrics["match"] - PENALTY * max(0.0, least - run.metrics["craft"])
