@@ -13,7 +13,6 @@ import styleexp
 PACKAGE = Path(styleexp.__file__).parent
 LAYERS = (
     ("cli",),
-    ("studio",),
     ("api", "testing"),
     ("experiments",),
     ("runs",),

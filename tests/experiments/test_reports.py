@@ -350,6 +350,22 @@ def test_axes_are_sorted_as_numbers_and_a_third_makes_sheets():
     assert len(empty) == 1
 
 
+def test_a_search_is_shown_best_first_and_without_a_grid(tmp_path):
+    runs = []
+    for number, match in enumerate((2.0, 4.5, 3.0, 1.0, 4.0, 3.5)):
+        at = tmp_path / str(number)
+        at.mkdir()
+        (at / "metrics.json").write_text(json.dumps({"match": match}))
+        given = [f"a={1 / (number + 3)}", f"b={number / 7}", f"c={number}"]
+        runs.append(reading.Run(at, status="done", overrides=given))
+    (only,) = sweep_page.split(tmp_path, runs)
+    (grid,) = only.grids
+    order = [cell.runs[0].folder.name for _, cells in grid.rows for cell in cells]
+    assert order == ["1", "4", "5", "2", "0", "3"]
+    assert only.axes["a"][-1] == "0.3333"
+    assert sweep_page.title(tmp_path, [only]).endswith(": 6 trials of a, b, c")
+
+
 def test_several_sweeps_keep_apart(tmp_path):
     write_run(tmp_path / "one" / "0", ["a=1"])
     write_run(tmp_path / "one" / "1", ["a=2"])

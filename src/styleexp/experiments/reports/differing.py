@@ -12,14 +12,24 @@ SEED = "optim.seed"
 """Key of the seed."""
 OMITTED = "not given"
 """Value of a run without an override for a key."""
+DIGITS = 8
 MOST_KEYS, MOST_VALUES = 3, 6
 """Number of keys that a title tells, and of values of each."""
 
 
 def settings(run: Run) -> dict[str, str]:
-    """A run's overrides by key, without Hydra's prefixes and without ``hydra.*`` keys."""
+    """A run's overrides by key, without Hydra's prefixes and without ``hydra.*`` keys. Numbers with
+    many digits, as a search draws them, are rounded to four."""
     pairs = (override.lstrip("+~").partition("=") for override in run.overrides)
-    return {key: value for key, _, value in pairs if not key.startswith("hydra")}
+    return {key: rounded(value) for key, _, value in pairs if not key.startswith("hydra")}
+
+
+def rounded(value: str) -> str:
+    """The text of a number with more than `DIGITS` characters, with four digits; other texts."""
+    try:
+        return f"{float(value):.4g}" if len(value) > DIGITS else value
+    except ValueError:
+        return value
 
 
 def of_overrides(runs: Sequence[Run]) -> dict[str, list[str]]:

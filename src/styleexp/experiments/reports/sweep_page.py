@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +19,10 @@ from styleexp.runs.records import RunFolder
 from styleexp.system.errors import UserError
 
 NAME = "report.html"
+SPARSE = 4
+"""Cells per run above which a grid isn't shown."""
+ABREAST = 5
+"""Pictures in a row where there is no grid."""
 
 
 @dataclass(frozen=True)
@@ -67,18 +72,30 @@ class Sweep:
         return ", ".join([*values, *([f"seed {seed}"] if seed else [])]) or run.folder.name
 
     @property
+    def scattered(self) -> bool:
+        """Whether a grid over the axes would be nearly empty, as that of a search."""
+        return math.prod(map(len, self.axes.values())) > SPARSE * len(self.runs)
+
+    @property
     def row_axis(self) -> str:
-        """Key of the grid's rows; empty for a single axis."""
-        return next(iter(self.axes)) if len(self.axes) > 1 else ""
+        """Key of the grid's rows; empty for a single axis, and for scattered runs."""
+        return next(iter(self.axes)) if len(self.axes) > 1 and not self.scattered else ""
 
     @property
     def column_axis(self) -> str:
-        """Key of the grid's columns."""
+        """Key of the grid's columns; empty for scattered runs."""
+        if self.scattered:
+            return ""
         return list(self.axes)[1] if len(self.axes) > 1 else next(iter(self.axes), "")
 
     @property
     def grids(self) -> list[Grid]:
-        """One sheet per combination of the axes from the third on."""
+        """One sheet per combination of the axes from the third on; for scattered runs one in all,
+        the best first."""
+        if self.scattered:
+            best = sorted(self.runs, key=_rank)
+            lines = [best[at : at + ABREAST] for at in range(0, len(best), ABREAST)]
+            return [Grid("", [("", [Cell([run]) for run in line]) for line in lines], [])]
         cells: dict[tuple[str, ...], Cell] = {}
         for run in self.runs:
             cells.setdefault(self.values(run), Cell()).runs.append(run)
@@ -152,6 +169,8 @@ def title(folder: Path, sweeps: list[Sweep]) -> str:
     if len(sweeps) != 1:
         return f"{name}: {len(sweeps)} sweeps"
     (sweep,) = sweeps
+    if sweep.scattered:
+        return f"{name}: {len(sweep.runs)} trials of {', '.join(sweep.axes)}"
     parts = [told] if (told := differing.told(sweep.axes)) else []
     if sweep.seeds:
         parts.append(f"{len({settings(run).get(SEED) for run in sweep.runs})} seeds")
@@ -193,6 +212,15 @@ def headline(run: Run) -> tuple[str, float] | None:
         if name in run.summary:
             return name, run.summary[name]
     return None
+
+
+def _rank(run: Run) -> float:
+    """Order of the runs of a search, the best first; unfinished ones last."""
+    shown = headline(run)
+    if shown is None:
+        return math.inf
+    name, value = shown
+    return -value if comparison.BETTER.get(name, -1) > 0 else value
 
 
 def measures(sweep: Sweep) -> list[str]:

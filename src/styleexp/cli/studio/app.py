@@ -16,8 +16,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from styleexp.studio.settings import Settings
-from styleexp.studio.workbench import LARGEST, Workbench, too_large
+from styleexp.cli.studio.settings import Settings
+from styleexp.cli.studio.workbench import LARGEST, Workbench, too_large
 from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:

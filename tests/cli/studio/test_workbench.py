@@ -9,9 +9,10 @@ import pytest
 import trimesh
 
 import styleexp
+from styleexp.cli.studio.kept import Remembering
+from styleexp.cli.studio.settings import Settings, safe_name
+from styleexp.cli.studio.workbench import Workbench
 from styleexp.inputs import meshes, shapes
-from styleexp.studio.settings import Settings, safe_name
-from styleexp.studio.workbench import Remembering, Workbench
 from styleexp.system.errors import UserError
 
 QUICK = ("source.refine=none", "baseline.bank=600", "threads=1")

@@ -13,33 +13,27 @@ import threading
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from styleexp.api import configured
+from styleexp.cli.studio.kept import Kept
+from styleexp.cli.studio.settings import Settings, safe_name
 from styleexp.config import build, sources
-from styleexp.config.checks import check
 from styleexp.experiments.reports import glb
 from styleexp.inputs import meshes
 from styleexp.inputs.style import Style
-from styleexp.method import masks
 from styleexp.method.base import Result, Scene
-from styleexp.method.subject import placed
 from styleexp.method.synthesis import method as synthesis
-from styleexp.studio.settings import Settings, safe_name
 from styleexp.system import process, progress
 from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from styleexp.method.subject import Subject
-    from styleexp.method.synthesis.exemplar import Exemplar, Places
 
 DRAFT = ("baseline.bank=1500", "source.refine=24000")
 """A first look in a fraction of the time: few patches to choose from, about 12,000 vertices."""
@@ -93,7 +87,7 @@ class Workbench:
         self._notes: list[str] = []
         self._made: Made | None = None
         self._learn, self._stop, self._closed = False, False, False
-        self._cache = _Cache()
+        self._kept = Kept()
         self._thread = threading.Thread(target=self._work, daemon=True, name="workbench")
 
     def start(self) -> None:
@@ -177,7 +171,7 @@ class Workbench:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content)
         if kind != "beside":
-            self._cache.forget(kind)
+            self._kept.forget(kind)
             self.change({kind: str(path)})
 
     def save(self, formats: list[str], size: int = 2048) -> list[Path]:
@@ -251,7 +245,7 @@ class Workbench:
 
     def _make(self, settings: Settings, serial: int, learns: bool) -> None:
         """Everything that the newest settings ask for."""
-        known = self._cache.heights_for(settings, ())
+        known = self._kept.heights_for(settings, ())
         own = {each.partition("=")[0] for each in settings.more}
         draft = tuple(each for each in DRAFT if each.partition("=")[0] not in own)
         passes = [()] if known is not None else [draft, ()]
@@ -267,16 +261,16 @@ class Workbench:
     def _synthesise(self, settings: Settings, serial: int, more: tuple[str, ...]) -> None:
         draft = bool(more)
         name = "a draft" if draft else "the relief"
-        with self._at(serial, f"preparing {name}"), self._cache.given(settings) as (config, load):
+        with self._at(serial, f"preparing {name}"), self._kept.given(settings) as (config, load):
             method = build.method_of(config(more))
             assert isinstance(method, synthesis.Synthesis)
-            subject = self._cache.subject(settings, more, config, load)
+            subject = self._kept.subject(settings, more, config, load)
             self._show_inputs(serial, subject, settings)
             if subject.smooth:
                 self._show(serial, method.finish(Scene(subject), None), settings, not draft)
                 return
-            begun = self._cache.begun(settings, more, subject)
-            height, last = self._cache.heights_for(settings, more), 0.0
+            begun = self._kept.begun(settings, more, subject)
+            height, last = self._kept.heights_for(settings, more), 0.0
             if height is None:
                 rounds = synthesis.heights(subject, begun, method.config)
                 for number, height in enumerate(rounds, 1):
@@ -288,13 +282,13 @@ class Workbench:
                     with self._lock:
                         self._tell(f"laying {name}, round {number}")
                 assert height is not None
-                self._cache.keep_heights(settings, more, height)
+                self._kept.keep_heights(settings, more, height)
             self._check(serial)
             self._show(serial, method.laid(subject, begun, height), settings, not draft)
 
     def _learn_from(self, settings: Settings, serial: int) -> None:
         """Steps of the learned method on top, until they are done or the user stops them."""
-        with self._at(serial, "preparing the learning"), self._cache.given(settings) as (config, _):
+        with self._at(serial, "preparing the learning"), self._kept.given(settings) as (config, _):
             method, scene = build.prepare(config(tuple(settings.learning)))
             state = method.start(scene)
             assert state is not None
@@ -322,7 +316,7 @@ class Workbench:
     def _show_inputs(self, serial: int, subject: Subject, settings: Settings) -> None:
         """Source and style as they are, once for each."""
         self._check(serial)
-        mesh, _ = self._cache.source(settings)
+        mesh, _ = self._kept.source(settings)
         style = subject.style
         facts: dict[str, Any] = {
             "source": {
@@ -361,115 +355,6 @@ class Workbench:
             self._looks["result"] = Look(self._version + 1, content)
             self._notes = list(result.subject.notes)
             self._tell(result={"vertices": len(result.vertices), "faces": len(result.faces)})
-
-
-class _Cache:
-    """What is kept between two settings, each thing for the newest that it was made for."""
-
-    def __init__(self) -> None:
-        self._kept: dict[str, tuple[Any, Any]] = {}
-
-    def forget(self, kind: str) -> None:
-        """Drop what depends on a file that was replaced."""
-        self._kept.clear()
-
-    def _get(self, name: str, key: Any, make: Callable[[], Any]) -> Any:
-        kept = self._kept.get(name)
-        if kept is None or kept[0] != key:
-            self._kept[name] = kept = (key, make())
-        return kept[1]
-
-    def source(self, settings: Settings) -> tuple[meshes.Mesh, Style]:
-        """The source and the style as read."""
-        config, _ = configured(settings.source, settings.style, [])
-        sources.check(config)
-        return (
-            self._get("source", settings.source, lambda: sources.load_source(config.source)),
-            self._get("style", settings.style, lambda: sources.load_style(config.style)),
-        )
-
-    @contextmanager
-    def given(self, settings: Settings) -> Iterator[tuple[Callable[..., Any], Any]]:
-        """Within it, source and style aren't read again. Yields a function from further overrides
-        to a configuration, and these two."""
-        mesh, style = self.source(settings)
-        given = style.mesh if style.mesh is not None else style.picture
-        assert given is not None
-
-        def config(more: tuple[str, ...] = ()) -> Any:
-            return configured(settings.source, settings.style, [*settings.overrides, *more])[0]
-
-        with sources.given(source=mesh, style=given):
-            yield config, (mesh, style)
-
-    def subject(self, settings: Settings, more: tuple[str, ...], config: Any, load: Any) -> Subject:
-        """The subject, measured anew only if source, style or scale differ."""
-        wanted = config(more)
-        check(wanted)
-        masks.check(wanted.style, load[0])
-
-        def make() -> Subject:
-            plain = replace(settings, mask="", strength=1.0, direction="auto", rotation=0.0)
-            options = configured(settings.source, settings.style, [*plain.overrides, *more])[0]
-            return build.subject_of(options, True)
-
-        key = (settings.source, settings.style, settings.scale, settings.invert, settings.seed)
-        subject: Subject = self._get(f"subject {more}", key, make)
-        mask, share = placed(wanted.style, subject.source, subject.areas)
-        notes = (*subject.notes, *share)
-        return replace(subject, settings=wanted, mask=mask, notes=notes)
-
-    def begun(self, settings: Settings, more: tuple[str, ...], subject: Subject) -> synthesis.Begun:
-        """The pattern and the source to walk on. Patches of the style that were sampled before with
-        the same random numbers are kept."""
-        key = (settings.source, settings.style, settings.scale, settings.invert, settings.seed)
-
-        def make() -> synthesis.Begun:
-            begun = synthesis.begin(subject)
-            return replace(begun, exemplar=Remembering(begun.exemplar))
-
-        found: synthesis.Begun = self._get(f"begun {more}", key, make)
-        return found
-
-    def _heights_key(self, settings: Settings) -> Any:
-        return replace(settings, strength=1.0, mask="", falloff=0.0, steps=100)
-
-    def heights_for(self, settings: Settings, more: tuple[str, ...]) -> Tensor | None:
-        """The synthesised heights, if only strength or mask have changed."""
-        kept = self._kept.get(f"heights {more}")
-        return kept[1] if kept and kept[0] == self._heights_key(settings) else None
-
-    def keep_heights(self, settings: Settings, more: tuple[str, ...], height: Tensor) -> None:
-        """Keep them for the next settings."""
-        self._kept[f"heights {more}"] = (self._heights_key(settings), height)
-
-
-class Remembering:
-    """An exemplar that keeps its samples, which another direction needs again: the same arguments
-    and random numbers give the same patches, and leave the generator in the same state."""
-
-    MOST = 6
-
-    def __init__(self, exemplar: Exemplar):
-        self._exemplar = exemplar
-        self._kept: dict[str, Any] = {}
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._exemplar, name)
-
-    def sample(
-        self, count: int, side: int, spacing: float, rng: np.random.Generator, any_way: bool
-    ) -> tuple[Tensor, Places]:
-        """See `Exemplar.sample`."""
-        key = repr((count, side, spacing, any_way, rng.bit_generator.state))
-        if key not in self._kept:
-            found = self._exemplar.sample(count, side, spacing, rng, any_way)
-            while len(self._kept) >= self.MOST:
-                del self._kept[next(iter(self._kept))]
-            self._kept[key] = (found, rng.bit_generator.state)
-        found, after = self._kept[key]
-        rng.bit_generator.state = after
-        return found
 
 
 def too_large(what: str) -> str:

@@ -1,0 +1,135 @@
+"""What the studio keeps between two settings, so that a change makes anew only what it changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from styleexp.api import configured
+from styleexp.config import build, sources
+from styleexp.config.checks import check
+from styleexp.inputs import meshes
+from styleexp.inputs.style import Style
+from styleexp.method import masks
+from styleexp.method.subject import placed
+from styleexp.method.synthesis import method as synthesis
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from styleexp.cli.studio.settings import Settings
+    from styleexp.method.subject import Subject
+    from styleexp.method.synthesis.exemplar import Exemplar, Places
+
+
+class Kept:
+    """What is kept between two settings, each thing for the newest that it was made for."""
+
+    def __init__(self) -> None:
+        self._kept: dict[str, tuple[Any, Any]] = {}
+
+    def forget(self, kind: str) -> None:
+        """Drop what depends on a file that was replaced."""
+        self._kept.clear()
+
+    def _get(self, name: str, key: Any, make: Callable[[], Any]) -> Any:
+        kept = self._kept.get(name)
+        if kept is None or kept[0] != key:
+            self._kept[name] = kept = (key, make())
+        return kept[1]
+
+    def source(self, settings: Settings) -> tuple[meshes.Mesh, Style]:
+        """The source and the style as read."""
+        config, _ = configured(settings.source, settings.style, [])
+        sources.check(config)
+        return (
+            self._get("source", settings.source, lambda: sources.load_source(config.source)),
+            self._get("style", settings.style, lambda: sources.load_style(config.style)),
+        )
+
+    @contextmanager
+    def given(self, settings: Settings) -> Iterator[tuple[Callable[..., Any], Any]]:
+        """Within it, source and style aren't read again. Yields a function from further overrides
+        to a configuration, and these two."""
+        mesh, style = self.source(settings)
+        given = style.mesh if style.mesh is not None else style.picture
+        assert given is not None
+
+        def config(more: tuple[str, ...] = ()) -> Any:
+            return configured(settings.source, settings.style, [*settings.overrides, *more])[0]
+
+        with sources.given(source=mesh, style=given):
+            yield config, (mesh, style)
+
+    def subject(self, settings: Settings, more: tuple[str, ...], config: Any, load: Any) -> Subject:
+        """The subject, measured anew only if source, style or scale differ."""
+        wanted = config(more)
+        check(wanted)
+        masks.check(wanted.style, load[0])
+
+        def make() -> Subject:
+            plain = replace(settings, mask="", strength=1.0, direction="auto", rotation=0.0)
+            options = configured(settings.source, settings.style, [*plain.overrides, *more])[0]
+            return build.subject_of(options, True)
+
+        key = (settings.source, settings.style, settings.scale, settings.invert, settings.seed)
+        subject: Subject = self._get(f"subject {more}", key, make)
+        mask, share = placed(wanted.style, subject.source, subject.areas)
+        notes = (*subject.notes, *share)
+        return replace(subject, settings=wanted, mask=mask, notes=notes)
+
+    def begun(self, settings: Settings, more: tuple[str, ...], subject: Subject) -> synthesis.Begun:
+        """The pattern and the source to walk on. Patches of the style that were sampled before with
+        the same random numbers are kept."""
+        key = (settings.source, settings.style, settings.scale, settings.invert, settings.seed)
+
+        def make() -> synthesis.Begun:
+            begun = synthesis.begin(subject)
+            return replace(begun, exemplar=Remembering(begun.exemplar))
+
+        found: synthesis.Begun = self._get(f"begun {more}", key, make)
+        return found
+
+    def _heights_key(self, settings: Settings) -> Any:
+        return replace(settings, strength=1.0, mask="", falloff=0.0, steps=100)
+
+    def heights_for(self, settings: Settings, more: tuple[str, ...]) -> Tensor | None:
+        """The synthesised heights, if only strength or mask have changed."""
+        kept = self._kept.get(f"heights {more}")
+        return kept[1] if kept and kept[0] == self._heights_key(settings) else None
+
+    def keep_heights(self, settings: Settings, more: tuple[str, ...], height: Tensor) -> None:
+        """Keep them for the next settings."""
+        self._kept[f"heights {more}"] = (self._heights_key(settings), height)
+
+
+class Remembering:
+    """An exemplar that keeps its samples, which another direction needs again: the same arguments
+    and random numbers give the same patches, and leave the generator in the same state."""
+
+    MOST = 6
+
+    def __init__(self, exemplar: Exemplar):
+        self._exemplar = exemplar
+        self._kept: dict[str, Any] = {}
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._exemplar, name)
+
+    def sample(
+        self, count: int, side: int, spacing: float, rng: np.random.Generator, any_way: bool
+    ) -> tuple[Tensor, Places]:
+        """See `Exemplar.sample`."""
+        key = repr((count, side, spacing, any_way, rng.bit_generator.state))
+        if key not in self._kept:
+            found = self._exemplar.sample(count, side, spacing, rng, any_way)
+            while len(self._kept) >= self.MOST:
+                del self._kept[next(iter(self._kept))]
+            self._kept[key] = (found, rng.bit_generator.state)
+        found, after = self._kept[key]
+        rng.bit_generator.state = after
+        return found
