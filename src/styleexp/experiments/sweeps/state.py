@@ -119,10 +119,12 @@ def cancel(folder: Path) -> Iterator[str]:
     found = of_folder(folder)
     (folder / CANCELLED).touch()
     if arrays := _arrays(folder):
-        subprocess.run(["scancel", *arrays], check=False)
-        yield f"cancelled in SLURM: {', '.join(arrays)}"
+        # Submitit ignores SIGTERM, scancel's own signal; a run ends by SIGINT with a checkpoint.
+        for how in ("--state=PENDING", "--signal=INT"):
+            subprocess.run(["scancel", how, *arrays], capture_output=True, check=False)
+        yield f"stopped in SLURM: {', '.join(arrays)}"
     for name, (state, _, known) in found.jobs.items():
-        if state != "running":
+        if state != "running" or arrays:
             continue
         where = known.get("host", "?")
         if where == platform.node() and isinstance(known.get("process"), int):
@@ -131,7 +133,7 @@ def cancel(folder: Path) -> Iterator[str]:
                 yield f"{name}: stopped"
             except OSError as error:
                 yield f"{name}: can't be stopped ({error})"
-        elif not arrays:
+        else:
             yield f"{name}: runs on {where} until it ends: cancel it there"
     yield f"no other job of '{folder}' starts until the plan is started again."
 
