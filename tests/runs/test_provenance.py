@@ -223,3 +223,25 @@ def test_it_refuses_with_one_sentence(arguments, told, swept, monkeypatch):
     monkeypatch.chdir(swept)
     with pytest.raises(UserError, match=told):
         command.main(arguments)
+
+
+def test_the_page_shows_the_code_and_what_a_run_was_resumed_with(tmp_path):
+    from styleexp.experiments.reports import page
+
+    digest = "c" * 64
+    told = {
+        "versions": {"torch": "2.0"},
+        "code": {"commit": "a" * 40, "dirty": True, "sha256": "b" * 64},
+        "plugins": [{"kind": "loss", "name": "<b>", "version": "1.2", "distribution": "lab",
+                     "file": "/x/lab.py", "sha256": digest, "origin": "lab (lab:LOSS)"}],
+        "resumed": [{"time": "2026-01-31", "differs": {"torch": ["2.0", "2.1"]}}],
+    }  # fmt: skip
+    (tmp_path / "run.json").write_text(json.dumps({"config": {}, "overrides": [], **told}))
+    text = page.rewrite(tmp_path).read_text()
+    for shown in (digest, "lab 1.2, /x/lab.py", "a" * 12 + " with changes", "torch 2.0 (then 2.1)"):
+        assert shown in text
+    assert "<b>" not in text
+    damaged = {"plugins": [3], "code": [], "resumed": [{"time": 3}], "weights": {"vgg": 1}}
+    (tmp_path / "run.json").write_text(json.dumps({"config": {}, "overrides": [], **damaged}))
+    assert len(reading.read(tmp_path).faults) == 4
+    page.rewrite(tmp_path)
