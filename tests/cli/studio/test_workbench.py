@@ -3,6 +3,7 @@
 import time
 import xml.etree.ElementTree as ET
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from styleexp.cli.studio.kept import Remembering
 from styleexp.cli.studio.settings import Settings, safe_name
 from styleexp.cli.studio.workbench import Workbench
 from styleexp.inputs import meshes, shapes
+from styleexp.method.synthesis import method as synthesis
 from styleexp.system.errors import UserError
 
 QUICK = ("source.refine=none", "baseline.bank=600", "threads=1")
@@ -83,6 +85,31 @@ def test_height_and_place_need_no_synthesis_and_direction_no_sampling(bench, mon
     bench.change({"rotation": 45.0})
     until(bench, lambda s: done(s) and s["settings"]["rotation"] == 45.0)
     assert any(stage and "round" in stage for stage in stages)
+
+
+def test_learning_goes_on_from_the_synthesis_until_it_is_stopped(files, tmp_path, monkeypatch):
+    relief = synthesis.relief
+    monkeypatch.setattr(
+        synthesis, "relief", lambda s, config, x: relief(s, replace(config, bank=600), x)
+    )
+    small = ("encoder=vgg19_random", "views.resolution=48", "views.local.per_view=1")
+    more = (*QUICK, *small)
+    given = Settings(str(files / "sphere.ply"), str(files / "bubble.ply"), more=more)
+    bench = Workbench(given.changed({"steps": 1000}), tmp_path)
+    bench.start()
+    until(bench, done)
+    start = saved_vertices(bench)[0]
+    bench.learn()
+    until(bench, lambda state: state["learned"] > 0)
+    bench.stop()
+    state = until(bench, done)
+    assert 0 < state["learned"] < 1000
+    vertices, command = saved_vertices(bench)
+    assert not np.array_equal(vertices, start)
+    assert {"method=robust", "field.start=synthesis", "optim.steps=1000"} < set(command.split())
+    bench.change({"strength": 0.5})
+    state = until(bench, lambda state: done(state) and state["learned"] == 0)
+    assert "method=robust" not in state["command"]
 
 
 def test_kept_samples_are_those_of_the_exemplar():

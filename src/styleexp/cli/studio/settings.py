@@ -85,16 +85,18 @@ class Settings:
 
     @property
     def learning(self) -> list[str]:
-        """Overrides with which learning goes on from the synthesis."""
+        """All overrides with which learning goes on from the synthesis. Options of the synthesis
+        itself (``baseline.``) aren't options of ``method=robust``."""
         return [
+            *(each for each in self.overrides if not each.startswith("baseline.")),
             "method=robust", "field.start=synthesis", "source.refine=auto", "profile=fast",
             f"optim.steps={self.steps}",
         ]  # fmt: skip
 
     def command(self, learned: bool = False) -> str:
         """The command that makes the same."""
-        more = self.learning if learned else []
-        return shlex.join(["styleexp", self.source, self.style, *self.overrides, *more])
+        overrides = self.learning if learned else self.overrides
+        return shlex.join(["styleexp", self.source, self.style, *overrides])
 
 
 def _fit(name: str, value: Any, kind: type) -> Any:

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from styleexp.api import configured
 from styleexp.cli.studio.kept import Kept
 from styleexp.cli.studio.settings import Settings, safe_name
 from styleexp.config import build, sources
@@ -288,8 +289,9 @@ class Workbench:
 
     def _learn_from(self, settings: Settings, serial: int) -> None:
         """Steps of the learned method on top, until they are done or the user stops them."""
-        with self._at(serial, "preparing the learning"), self._kept.given(settings) as (config, _):
-            method, scene = build.prepare(config(tuple(settings.learning)))
+        with self._at(serial, "preparing the learning"), self._kept.given(settings):
+            config, _ = configured(settings.source, settings.style, settings.learning)
+            method, scene = build.prepare(config)
             state = method.start(scene)
             assert state is not None
             last = time.monotonic()
