@@ -641,7 +641,7 @@ def test_every_truncation_of_a_good_file_is_either_read_or_explained(tmp_path, s
 def test_saving_says_what_is_wrong(tmp_path):
     mesh = meshes.load_mesh(write_obj(tmp_path / "a.obj", CUBE, QUADS))
     with pytest.raises(UserError, match=r"supported formats are \.ply, \.obj, \.glb, \.stl, \.3mf"):
-        meshes.save_mesh(mesh, mesh.vertices, tmp_path / "b.stl")
+        meshes.save_mesh(mesh, mesh.vertices, tmp_path / "b.fbx")
     with pytest.raises(UserError, match="diverged"):
         meshes.save_mesh(mesh, mesh.vertices * np.nan, tmp_path / "b.ply")
     with pytest.raises(ValueError, match="shape"):

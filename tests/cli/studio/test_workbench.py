@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 import styleexp
 from styleexp.cli.studio.kept import Remembering
@@ -92,9 +93,11 @@ def test_learning_goes_on_from_the_synthesis_until_it_is_stopped(files, tmp_path
     monkeypatch.setattr(
         synthesis, "relief", lambda s, config, x: relief(s, replace(config, bank=600), x)
     )
+    rows, columns = np.sin(np.mgrid[0:64, 0:64] / 4)
+    discs = (255 * (rows * columns).clip(0)).astype(np.uint8)
+    Image.fromarray(discs).save(tmp_path / "discs.png")  # which isn't rendered, as a mesh is
     small = ("encoder=vgg19_random", "views.resolution=48", "views.local.per_view=1")
-    more = (*QUICK, *small)
-    given = Settings(str(files / "sphere.ply"), str(files / "bubble.ply"), more=more)
+    given = Settings(str(files / "sphere.ply"), str(tmp_path / "discs.png"), more=(*QUICK, *small))
     bench = Workbench(given.changed({"steps": 1000}), tmp_path)
     bench.start()
     until(bench, done)
@@ -174,7 +177,7 @@ def test_maps_need_texture_coordinates(bench):
         ({"strength": 9}, "from -2 to 2"),
         ({"strength": True}, "must be a number"),
         ({"scale": float("nan")}, "must be a number"),
-        ({"direction": "left"}, "is none of auto"),
+        ({"direction": "left"}, "is not one of auto"),
         ({"source": "a\nb"}, "must be a short text"),
         ({"invert": 1}, "must be true or false"),
         ({"more": ["hydra.run.dir=/"]}, "no setting 'more'"),

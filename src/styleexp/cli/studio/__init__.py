@@ -16,9 +16,9 @@ from pathlib import Path
 from styleexp.system.errors import UserError
 
 DESCRIPTION = """\
-Open a local page on which a style is put on a mesh: drop both, turn size, height and direction,
-choose where, watch, and save the mesh, its maps, and the command that makes the same. Only this
-machine can open it. Needs the extra studio."""
+Open a local web page to stylise a mesh interactively: drop a mesh and a style, adjust size, height,
+direction and mask, and save the mesh, its height and normal maps, and the equivalent command. Only
+this machine can open the page. Needs the extra studio."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -42,7 +42,9 @@ def _serve(options: argparse.Namespace) -> int:
     more = tuple(word for word in options.words if "=" in word and not Path(word).exists())
     files = [word for word in options.words if word not in more]
     if len(files) > 2:
-        raise UserError(f"'{files[2]}' is one word too many: give a mesh, a style and KEY=VALUE.")
+        raise UserError(
+            f"unexpected argument '{files[2]}': give at most a mesh, a style and KEY=VALUE options."
+        )
     settings = Settings(more=more).changed(dict(zip(("source", "style"), files, strict=False)))
     sources.check(configure(settings.source, settings.style, settings.overrides))
     folder = options.out or Path("outputs/studio") / f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
@@ -64,7 +66,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--port", type=int, default=0, help="default: any free one")
     parser.add_argument(
-        "--out", type=Path, metavar="FOLDER", help="for all files (default: outputs/studio/DATE)"
+        "--out",
+        type=Path,
+        metavar="FOLDER",
+        help="folder for uploaded and saved files (default: outputs/studio/DATE)",
     )
     parser.add_argument("--no-browser", action="store_true", help="only print the address")
     return parser

@@ -1,7 +1,7 @@
 """The studio's server: a page, and what it asks for, to a browser on this machine alone.
 
 Every address starts with a token that only the terminal shows, requests for other hosts than this
-machine are refused (a page elsewhere can't have its name resolve to us), and the page runs no
+machine are refused (protection against DNS rebinding), and the page runs no
 script but its own.
 """
 
@@ -76,7 +76,9 @@ def application(bench: Workbench, token: str) -> Starlette:
         except UserError as error:
             return JSONResponse({"error": str(error)}, 422)
         except OSError as error:
-            return JSONResponse({"error": f"can't be written: {error.strerror or error}."}, 422)
+            return JSONResponse(
+                {"error": f"a file can't be written: {error.strerror or error}."}, 422
+            )
 
     async def receive(request: Request) -> Response:
         parts, size = [], 0

@@ -59,7 +59,8 @@ class Settings:
             "attribute:"
         ):
             raise UserError(
-                f"direction '{values['direction']}' is none of {', '.join(DIRECTIONS)}."
+                f"direction '{values['direction']}' is not one of {', '.join(DIRECTIONS)} or "
+                "attribute:NAME."
             )
         return Settings(**values)
 

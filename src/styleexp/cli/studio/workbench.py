@@ -281,7 +281,7 @@ class Workbench:
                         self._show(serial, result, settings, False)
                         last = time.monotonic()
                     with self._lock:
-                        self._tell(f"laying {name}, round {number}")
+                        self._tell(f"synthesising {name}, round {number}")
                 assert height is not None
                 self._kept.keep_heights(settings, more, height)
             self._check(serial)
@@ -289,7 +289,7 @@ class Workbench:
 
     def _learn_from(self, settings: Settings, serial: int) -> None:
         """Steps of the learned method on top, until they are done or the user stops them."""
-        with self._at(serial, "preparing the learning"), self._kept.given(settings):
+        with self._at(serial, "preparing for learning"), self._kept.given(settings):
             config, _ = configured(settings.source, settings.style, settings.learning)
             method, scene = build.prepare(config)
             state = method.start(scene)

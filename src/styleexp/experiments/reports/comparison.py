@@ -41,10 +41,10 @@ PLAIN = range(-3, 5)
 """Powers of ten that a LaTeX table shows without an exponent."""
 INTERVAL = "Mean and 95 % confidence interval (Student's t) over n finished runs."
 CAPTION = (
-    f"{INTERVAL} p: that the difference "
-    "from the first row, on the same pairs and seeds, is chance; two-sided permutation of its "
-    "signs, corrected over the column's rows (Holm). Seeds of one pair aren't independent, so p is "
-    "too small where few pairs have many seeds."
+    f"{INTERVAL} p: two-sided sign-flip permutation test of the mean difference from the first "
+    "row, on the same pairs and seeds, Holm-corrected over the column's rows. Seeds of one pair "
+    "aren't independent, so p is too small and the interval too narrow where few pairs have many "
+    "seeds."
 )
 
 

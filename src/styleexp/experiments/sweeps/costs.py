@@ -1,8 +1,8 @@
 """What is left of a plan costs: core-hours and disk, from its own finished jobs or its estimates.
 
-A job's core-seconds are its wall time by its threads, both from its record. Jobs of an experiment
-without any finished one count by the plan's ``minutes``, which are on two cores; without these, and
-the disk without a finished job, the cost is unknown, and said to be.
+A job's core-seconds are its wall time times its threads, both from its record. Jobs of an
+experiment without any finished one count by the plan's ``minutes``, which are on two cores; without
+these, and the disk without a finished job, the cost is unknown, and said to be.
 """
 
 from __future__ import annotations

@@ -122,7 +122,7 @@ def cancel(folder: Path) -> Iterator[str]:
         # Submitit ignores SIGTERM, scancel's own signal; a run ends by SIGINT with a checkpoint.
         for how in ("--state=PENDING", "--signal=INT"):
             subprocess.run(["scancel", how, *arrays], capture_output=True, check=False)
-        yield f"stopped in SLURM: {', '.join(arrays)}"
+        yield f"asked SLURM to stop: {', '.join(arrays)}"
     for name, (state, _, known) in found.jobs.items():
         if state != "running" or arrays:
             continue

@@ -126,11 +126,11 @@
 
   // ---------------------------------------------------------------- from the studio to the page
   const WHERE = [["", "the whole surface"], ["height:0.5..1", "upper half"], ["height:0..0.5", "lower half"],
-    ["slope:60", "what faces up"], ["not:slope:60", "what doesn't face up"]];
+    ["slope:60", "upward-facing parts"], ["not:slope:60", "all but upward-facing parts"]];
   function places() {
     const attributes = state.source?.attributes || [];
     const all = [...WHERE, ...attributes.flatMap((name) =>
-      [[`attribute:${name}`, `where ${name} is high`], [`not:attribute:${name}`, `where ${name} is low`]]), ["own", "own terms …"]];
+      [[`attribute:${name}`, `where ${name} is high`], [`not:attribute:${name}`, `where ${name} is low`]]), ["own", "custom mask …"]];
     const key = JSON.stringify(all);
     if (byId("where").dataset.key !== key) {
       byId("where").dataset.key = key;
