@@ -169,10 +169,10 @@ def test_what_differs_is_told_one_by_one(swept, tmp_path, capsys, coarse_shapes)
 
     assert told()[0] == reproduce.SAME
     metrics = json.loads((new / "metrics.json").read_text())
-    (new / "metrics.json").write_text(json.dumps(metrics | {"spike": 99.5}))
+    (new / "metrics.json").write_text(json.dumps(metrics | {"bend": 99.5}))
     ended, out = told()
     assert ended == reproduce.DIFFERENT
-    assert f"{metrics['spike']!r} then, 99.5 now" in out
+    assert f"{metrics['bend']!r} then, 99.5 now" in out
     assert out.count("equal\n") == len(metrics) - 1
     content = (new / "result.ply").read_bytes()
     table = ply.parse(content)

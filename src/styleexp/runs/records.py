@@ -66,6 +66,10 @@ PACKAGES = (
 )
 """Packages whose versions are recorded."""
 
+VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""Environment variables that a result's last bits depend on: with other numbers of threads, numpy's
+products are summed in another order. (``threads`` is about torch.)"""
+
 
 @dataclass
 class RunFolder:
@@ -259,12 +263,13 @@ def describe(config: Any, overrides: list[str], command: list[str]) -> dict[str,
 
 def environment(config: Any) -> dict[str, Any]:
     """What a run is made with, for its record: ``versions`` of packages, ``code`` of this package
-    (`plugins.code.own`), ``plugins`` (`plugins.used`), and the ``platform``."""
+    (`plugins.code.own`), ``plugins`` (`plugins.used`), and the ``platform`` with `VARIABLES`."""
+    variables = {name: os.environ.get(name, "not set") for name in VARIABLES}
     return {
         "versions": {"python": platform.python_version(), **_versions()},
         "code": code.own(),
         "plugins": plugins.used(config),
-        "platform": {"system": platform.platform(), "machine": platform.machine()},
+        "platform": {"system": platform.platform(), "machine": platform.machine(), **variables},
     }
 
 
