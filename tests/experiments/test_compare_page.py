@@ -31,9 +31,9 @@ def write_run(folder, overrides, config, seconds=3.0, versions=None, **metrics):
 @pytest.fixture
 def pair(tmp_path):
     part = {"source": {"name": "sphere"}, "style": {"name": "bubble"}, "field": {"sigma": 2.0}}
-    for name, strength, bend in (("a", 1.0, 3.0), ("b", 0.5, 2.5)):
+    for name, strength, order in (("a", 1.0, 3.0), ("b", 0.5, 2.5)):
         given = ["source=sphere", "style=bubble", f"strength={strength:g}", "field.sigma=2"]
-        write_run(tmp_path / name, given, part | {"strength": strength}, bend=bend,
+        write_run(tmp_path / name, given, part | {"strength": strength}, order=order,
                   match=strength, bend=0.2)  # fmt: skip
     return tmp_path
 
@@ -67,10 +67,10 @@ def test_measures_know_the_best_and_the_change(pair):
     runs = [reading.read(pair / name) for name in ("a", "b")]
     found, equal = compare_page.measures(runs)
     by_name = {each.name: each for each in found}
-    assert [each.name for each in found] == ["match", "bend"]
+    assert [each.name for each in found] == ["match", "order"]
     assert by_name["match"].best == 1.0
-    assert by_name["bend"].best is None  # neither way is known to be better
-    assert by_name["bend"].change(1) == -0.5
+    assert by_name["order"].best is None  # neither way is known to be better
+    assert by_name["order"].change(1) == -0.5
     assert equal == ["bend", "seconds"]
 
 
