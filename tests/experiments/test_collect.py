@@ -116,16 +116,14 @@ def test_an_empty_folder_is_an_empty_table_and_none_is_a_mistake(tmp_path):
         collect(tmp_path / "none")
 
 
-def test_a_search_minimises_the_style_distance_of_results_that_keep_their_outline(
-    tmp_path, monkeypatch
-):
-    monkeypatch.setenv(objective.LEAST_IOU, "0.95")
+def test_a_search_wants_a_match_with_enough_craft(tmp_path, monkeypatch):
+    monkeypatch.setenv(objective.LEAST_CRAFT, "3")
 
     def value(**metrics):
         (tmp_path / "metrics.json").write_text(json.dumps(metrics))
         return objective.objective(tmp_path)
 
-    assert value(style_distance=0.4, silhouette_iou=0.97) == 0.4
-    assert value(style_distance=0.2, silhouette_iou=0.85) == pytest.approx(1.2)
-    with pytest.raises(UserError, match="silhouette_iou"):
-        value(style_distance=0.2)
+    assert value(match=4.0, craft=3.5) == 4.0
+    assert value(match=4.0, craft=2.5) == pytest.approx(3.0)
+    with pytest.raises(UserError, match="craft"):
+        value(match=4.0)
