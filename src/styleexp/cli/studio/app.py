@@ -1,8 +1,7 @@
 """The studio's server: a page, and what it asks for, to a browser on this machine alone.
 
 Every address starts with a token that only the terminal shows, requests for other hosts than this
-machine are refused (protection against DNS rebinding), and the page runs no
-script but its own.
+machine are refused (protection against DNS rebinding), and the page runs no script but its own.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ def application(bench: Workbench, token: str) -> Starlette:
 
     def state(request: Request) -> Response:
         since = request.query_params.get("since", "-1")
-        number = int(since) if since.lstrip("-").isdecimal() else -1
+        number = int(since) if since.isdecimal() else -1
         return JSONResponse(bench.state(number, WAIT), headers={"Cache-Control": "no-store"})
 
     def look(request: Request) -> Response:

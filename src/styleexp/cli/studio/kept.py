@@ -32,8 +32,8 @@ class Kept:
     def __init__(self) -> None:
         self._kept: dict[str, tuple[Any, Any]] = {}
 
-    def forget(self, kind: str) -> None:
-        """Drop what depends on a file that was replaced."""
+    def clear(self) -> None:
+        """Drop everything, because a file was replaced under the same name."""
         self._kept.clear()
 
     def _get(self, name: str, key: Any, make: Callable[[], Any]) -> Any:

@@ -88,11 +88,12 @@ class Settings:
     def learning(self) -> list[str]:
         """All overrides with which learning goes on from the synthesis. Options of the synthesis
         itself (``baseline.``) aren't options of ``method=robust``."""
-        return [
-            *(each for each in self.overrides if not each.startswith("baseline.")),
-            "method=robust", "field.start=synthesis", "source.refine=auto", "profile=fast",
-            f"optim.steps={self.steps}",
-        ]  # fmt: skip
+        given = [each for each in self.overrides if not each.startswith("baseline.")]
+        keys = {each.partition("=")[0] for each in given}
+        plain = ("method=robust", "field.start=synthesis", "source.refine=auto", "profile=fast")
+        more = [each for each in (*plain, f"optim.steps={self.steps}")
+                if each.partition("=")[0] not in keys]  # fmt: skip
+        return [*given, *more]
 
     def command(self, learned: bool = False) -> str:
         """The command that makes the same."""

@@ -89,6 +89,7 @@ class Workbench:
         self._made: Made | None = None
         self._learn, self._stop, self._closed = False, False, False
         self._kept = Kept()
+        self._inputs: tuple[int, int] | None = None
         self._thread = threading.Thread(target=self._work, daemon=True, name="workbench")
 
     def start(self) -> None:
@@ -172,7 +173,9 @@ class Workbench:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content)
         if kind != "beside":
-            self._kept.forget(kind)
+            self._kept.clear()
+            with self._lock:
+                self._made = None  # it may be of another file of this name
             self.change({kind: str(path)})
 
     def save(self, formats: list[str], size: int = 2048) -> list[Path]:
@@ -184,12 +187,14 @@ class Workbench:
         if unknown := set(formats) - set(FORMATS):
             raise UserError(f"'{unknown.pop()}' is none of {', '.join(FORMATS)}.")
         stem = "-".join(Path(part).stem for part in (made.settings.source, made.settings.style))
+        if "maps" in formats:
+            from styleexp.runs import bake
+
+            bake.coordinates(made.result.subject.source)  # before anything is written
         target = _fresh(self.folder / stem)
         written = []
         for kind in formats:
             if kind == "maps":
-                from styleexp.runs import bake
-
                 subject = made.result.subject
                 maps = bake.bake(
                     subject.source, made.result.displacement, made.result.vertices, size
@@ -249,7 +254,7 @@ class Workbench:
         known = self._kept.heights_for(settings, ())
         own = {each.partition("=")[0] for each in settings.more}
         draft = tuple(each for each in DRAFT if each.partition("=")[0] not in own)
-        passes = [()] if known is not None else [draft, ()]
+        passes: list[tuple[str, ...]] = [draft, ()] if draft and known is None else [()]
         if not learns or self._made is None or self._made.settings != settings:
             for more in passes:
                 self._synthesise(settings, serial, more)
@@ -318,7 +323,7 @@ class Workbench:
     def _show_inputs(self, serial: int, subject: Subject, settings: Settings) -> None:
         """Source and style as they are, once for each."""
         self._check(serial)
-        mesh, _ = self._kept.source(settings)
+        mesh, load_style = self._kept.source(settings)
         style = subject.style
         facts: dict[str, Any] = {
             "source": {
@@ -333,11 +338,9 @@ class Workbench:
                 "picture": style.mesh is None,
             },
         }
-        if (
-            self._facts.get("source") == facts["source"]
-            and self._facts.get("style") == facts["style"]
-        ):
+        if self._inputs == (id(mesh), id(load_style)):
             return
+        self._inputs = (id(mesh), id(load_style))
         shown = {"source": _bare(mesh)}
         shown["style"] = _bare(style.mesh) if style.mesh is not None else _png(style)
         with self._lock:
