@@ -167,8 +167,30 @@ def test_prints_hold_the_same_surface(bench):
 
 def test_maps_need_texture_coordinates(bench):
     until(bench, done)
+    before = sorted(bench.folder.iterdir())
     with pytest.raises(UserError, match="no texture coordinates"):
-        bench.save(["maps"])
+        bench.save(["glb", "maps"])
+    assert sorted(bench.folder.iterdir()) == before
+
+
+def test_another_file_of_the_same_name_is_another_mesh(files, tmp_path):
+    bench = Workbench(Settings(style=str(files / "bubble.ply"), more=QUICK), tmp_path)
+    content = (files / "sphere.ply").read_bytes()
+    bench.receive("source", "ball.ply", content)
+    bench.start()
+    until(bench, done)
+    first = bench.look("source").version
+    bench.receive("source", "ball.ply", content)
+    with pytest.raises(UserError, match="isn't finished"):
+        bench.save(["ply"])
+    until(bench, done)
+    assert bench.look("source").version > first
+
+
+def test_learning_keeps_the_options_that_were_given():
+    learning = Settings(more=("source.refine=none", "baseline.bank=600")).learning
+    assert "source.refine=none" in learning
+    assert not {"source.refine=auto", "baseline.bank=600"} & set(learning)
 
 
 @pytest.mark.parametrize(

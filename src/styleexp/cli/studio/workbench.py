@@ -89,7 +89,7 @@ class Workbench:
         self._made: Made | None = None
         self._learn, self._stop, self._closed = False, False, False
         self._kept = Kept()
-        self._inputs: tuple[int, int] | None = None
+        self._inputs: tuple[meshes.Mesh | None, Style | None] = (None, None)
         self._thread = threading.Thread(target=self._work, daemon=True, name="workbench")
 
     def start(self) -> None:
@@ -323,7 +323,7 @@ class Workbench:
     def _show_inputs(self, serial: int, subject: Subject, settings: Settings) -> None:
         """Source and style as they are, once for each."""
         self._check(serial)
-        mesh, load_style = self._kept.source(settings)
+        mesh, read = self._kept.source(settings)
         style = subject.style
         facts: dict[str, Any] = {
             "source": {
@@ -338,9 +338,9 @@ class Workbench:
                 "picture": style.mesh is None,
             },
         }
-        if self._inputs == (id(mesh), id(load_style)):
+        if self._inputs[0] is mesh and self._inputs[1] is read:
             return
-        self._inputs = (id(mesh), id(load_style))
+        self._inputs = (mesh, read)
         shown = {"source": _bare(mesh)}
         shown["style"] = _bare(style.mesh) if style.mesh is not None else _png(style)
         with self._lock:
