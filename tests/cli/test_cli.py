@@ -116,6 +116,7 @@ def test_interrupt_checkpoints_and_says_how_to_go_on(tmp_path):
     status = json.loads((folder / "status.json").read_text())
     assert status["status"] == "interrupted"
     assert (folder / "checkpoint.safetensors").exists()
+    assert f"styleexp resume={folder}" in (folder / "report.html").read_text()
 
 
 def test_an_interrupted_synthesis_says_how_to_run_it_again(tmp_path):

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from styleexp.encoders.options import judge_name
-from styleexp.experiments import endings, progress
+from styleexp.experiments import endings, live, progress
 from styleexp.experiments.sweeps.claim import PATIENCE, busy
 from styleexp.runs import identity, origins, reading, records
 from styleexp.runs.jobs import Job
@@ -131,11 +131,12 @@ def _guarded(
     atomic.sweep(folder.path)
     # Replace a finished run only once the new one can start: a typo must not cost a result.
     replaces = not resumed and reading.read(folder.path).last_status == "done"
+    look = live.Live(folder, config.report)
     try:
         if not replaces:
-            folder.begin(None if resumed else record)
+            _begin(folder, None if resumed else record, look)
         with announced():
-            return _execute(config, folder, record, resumed)
+            return _execute(config, folder, record, resumed, look)
     except BrokenPipeError:  # as with `styleexp ... | head`; not the folder's fault
         folder.write_status("interrupted", reason="the output pipe was closed")
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -155,6 +156,16 @@ def _guarded(
         message = endings.out_of_memory(config, error)
         endings.fail(folder, message)
         raise UserError(message) from error
+    finally:
+        look.end()
+
+
+def _begin(folder: records.RunFolder, record: dict[str, Any] | None, look: live.Live) -> None:
+    """Mark the folder as running, and say where to watch."""
+    folder.begin(record)
+    if look.wanted:
+        print("watch it on this page, which reloads itself:", flush=True)
+        progress.print_paths([look.path])
 
 
 def _resuming(folder: records.RunFolder) -> str:
@@ -166,7 +177,11 @@ def _resuming(folder: records.RunFolder) -> str:
 
 
 def _execute(
-    config: Config, folder: records.RunFolder, record: dict[str, Any], resumed: bool
+    config: Config,
+    folder: records.RunFolder,
+    record: dict[str, Any],
+    resumed: bool,
+    look: live.Live,
 ) -> int:
     """Prepare, optimise, write and measure; return the exit code."""
     from styleexp.config import build
@@ -176,8 +191,9 @@ def _execute(
     _check(config)
     method, scene = build.prepare(config)
     if not folder.begun:
-        folder.begin(record)
+        _begin(folder, record, look)
     doing("")
+    look.prepared(scene.subject)
     for note in (*scene.subject.notes, *scene.notes):
         print(f"note: {note}")
     assets = _unchanged_assets(config, record)
@@ -189,9 +205,10 @@ def _execute(
 
     step = state.step if state else 0
     with Loggers(config, folder.path, record, step) as loggers:
-        if state is not None and not _optimise(method, scene, state, config, folder, loggers):
+        if state is not None and not _optimise(method, scene, state, config, folder, loggers, look):
             return INTERRUPTED
         result = method.finish(scene, state)
+        look.result(result)
         step = state.step if state else 0
         written, measured = _write_results(result, config, folder)
         seconds = time.perf_counter() - started
@@ -199,6 +216,7 @@ def _execute(
             from styleexp.experiments.reports import page
 
             doing("writing the run's page")
+            look.replaced()
             written.insert(0, page.write_ended(folder.path, result, seconds))
         loggers.finish(result, folder.path, measured, step)
         folder.check()
@@ -285,6 +303,7 @@ def _optimise(
     config: Config,
     folder: records.RunFolder,
     loggers: Loggers,
+    look: live.Live,
 ) -> bool:
     """Run the remaining steps; return False if the user stopped them."""
     optim = config.optim
@@ -294,6 +313,7 @@ def _optimise(
         for step in progress.shown(steps, state.step, optim.steps):
             folder.append_metrics(step)
             loggers.step(step)
+            look.step(step, optim.steps, lambda: method.finish(scene, state))
             blank += getattr(step, "blank_views", 0)
             if state.step % optim.checkpoint_every == 0 or interrupted:
                 folder.save_checkpoint(state)

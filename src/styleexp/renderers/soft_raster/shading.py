@@ -48,7 +48,7 @@ class FlatSurface:
     def at_pixels(self, visible: Visible) -> Float[Tensor, "lights winners"]:
         """Intensities of the covered pixels."""
         # Not a matrix product: on some processors its last bit depends on how many views there are.
-        lit = _dot(self.light.unsqueeze(-1).unbind(2), self.normals)
+        lit = _dot(self.light.unsqueeze(-1).unbind(2), self.normals.unbind(0))
         intensity = (self.shading.albedo * (self.shading.ambient + lit)).clamp(0, 1)
         index = visible.view * intensity.shape[2] + visible.face
         return torch.stack([PickOne.apply(one, index) for one in intensity])
