@@ -12,7 +12,7 @@ from tests.helpers.browser import browser, check_quiet, covered, pixels, wait
 
 EVIL = "<img src=x onerror=alert(1)>"
 SMOKE = ["method=robust", "profile=smoke", "encoder=vgg19_random"]
-PARTICIPANTS = 20
+PARTICIPANTS = 4
 
 
 def styleexp(*arguments, cwd):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from styleexp.experiments import execute
 from styleexp.experiments.sweeps import claim
+from styleexp.inputs import measured
 from styleexp.runs import identity, origins, provenance, reading, records, results
 from styleexp.system.errors import UserError
 
@@ -64,7 +65,9 @@ def reproduce(folder: Path, out: Path | None = None) -> int:
     tell_differences(run, _here(config, run))
     here = folder.absolute()
     new = out or claim.fresh(HOME / here.parent.name / here.name)
-    code = execute.run(config, new, run.overrides, command=["styleexp", "reproduce", str(folder)])
+    command = ["styleexp", "reproduce", str(folder)]
+    with measured.anew():
+        code = execute.run(config, new, run.overrides, command=command)
     if code:
         return code
     return tell_results(run, reading.read(new), config)

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from scipy.spatial.distance import cdist
 
+from styleexp.inputs import measured
 from styleexp.method.relief import smoother
 from styleexp.method.synthesis.direction import frames, turned
 from styleexp.method.synthesis.exemplar import measure
@@ -108,6 +109,12 @@ class Likeness:
 
 def bank_of(exemplar: Exemplar) -> Bank:
     """The patches of a style, and how like each other and noise they are."""
+    found = measured.kept("bank", exemplar.arrays(), "", lambda: _measured(exemplar))
+    wavelength, own, chance, height = map(float, found["numbers"])
+    return Bank(torch.from_numpy(found["slopes"]), wavelength, own, chance, height)
+
+
+def _measured(exemplar: Exemplar) -> measured.Arrays:
     rng = np.random.default_rng(0)
     wavelength = measure(exemplar, rng).wavelength
     spacing = wavelength / PER_WAVE
@@ -117,13 +124,13 @@ def bank_of(exemplar: Exemplar) -> Bank:
     )
     bank = unit_slopes(patches)
     apart = cdist(exemplar.centres(held_out), exemplar.centres(places)) > SIDE * spacing
-    return Bank(
-        bank,
+    numbers = (
         wavelength,
         float(nearest(unit_slopes(others), bank, torch.from_numpy(apart)).median()),
         float(nearest(unit_slopes(like_noise(others)), bank).median()),
         float(others.std(dim=(1, 2)).median()),
     )
+    return {"slopes": bank.numpy(), "numbers": np.array(numbers)}
 
 
 def likeness(bank: Bank, relief: Relief, unit: float, seed: int = 0) -> Likeness:

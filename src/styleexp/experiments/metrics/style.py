@@ -7,12 +7,14 @@ on results with a known answer: see ``truth`` and docs/metrics.md.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, TypeAlias
 
+import numpy as np
 import torch
 from torch.nn import functional
 
+from styleexp.inputs import measured
 from styleexp.method import pictures, targets
 from styleexp.method.losses import gram_matrix, layer_mask
 from styleexp.method.patches import SIZE, WINDOW, Relief, Windows, blurred, relief_of_mesh, windows
@@ -21,7 +23,6 @@ from styleexp.renderers.base import Shading
 from styleexp.system.transfer import to_host
 
 if TYPE_CHECKING:
-    import numpy as np
     from jaxtyping import Bool, Float
     from torch import Tensor
 
@@ -98,10 +99,51 @@ def judged_style(style: Style, config: Config, encoder: Encoder, unit: float) ->
 
     ``unit`` is the pattern's size on the source; an image's size is a multiple of it.
     """
+    given = {f"encoder.{name}": each for name, each in encoder.state_dict().items()}
+    about = f"{type(encoder).__qualname__} {encoder.precision}"
     if style.mesh is not None:
-        return judged(relief_of_mesh(style.mesh), 1.0, encoder, STYLE_WINDOWS)
-    assert style.picture is not None
-    return judged_picture(style.picture, config, picture_span(config, unit) / unit, encoder)
+        mesh = style.mesh
+        given |= {"vertices": mesh.vertices, "faces": mesh.faces}
+
+        def look() -> Looks:
+            return judged(relief_of_mesh(mesh), 1.0, encoder, STYLE_WINDOWS)
+    else:
+        picture = style.picture
+        assert picture is not None
+        span = picture_span(config, unit) / unit
+        given |= {"picture": picture}
+        about += f" {span} {config.style} {config.baseline is None}"
+
+        def look() -> Looks:
+            return judged_picture(picture, config, span, encoder)
+
+    on_cpu = next(encoder.parameters()).device.type == "cpu"
+    if not on_cpu or not type(encoder).__module__.startswith("styleexp."):
+        return look()  # neither a device nor a plugin's code is part of the key
+    return _looks(measured.kept("looks", given, about, lambda: _arrays(look())))
+
+
+def _arrays(looks: Looks) -> measured.Arrays:
+    """A look's tensors by name, to be kept; in order, since there are fewer than a hundred."""
+    made = {f"shaded.{n:02}": each.cpu().numpy() for n, each in enumerate(looks.shaded)}
+    made |= {f"height.{n:02}": each.cpu().numpy() for n, each in enumerate(looks.height or ())}
+    if looks.statistics is not None:
+        made |= {
+            f"of.{f.name}": getattr(looks.statistics, f.name).cpu().numpy()
+            for f in fields(Statistics)
+        }
+    return made | {"has_height": np.array(looks.height is not None)}
+
+
+def _looks(made: measured.Arrays) -> Looks:
+    def named(prefix: str) -> list[Tensor]:
+        return [torch.from_numpy(made[name]) for name in sorted(made) if name.startswith(prefix)]
+
+    known = {f.name: made.get(f"of.{f.name}") for f in fields(Statistics)}
+    found = None
+    if all(each is not None for each in known.values()):
+        found = Statistics(**{name: torch.from_numpy(each) for name, each in known.items()})
+    return Looks(named("shaded."), named("height.") if made["has_height"] else None, found)
 
 
 def judged_picture(

@@ -99,8 +99,8 @@ def build(run: Run, shown: Shown) -> str:
         style_picture=style_picture(shown.style),
         heat=_heat(shown),
         curves=curves(run),
+        notes=run.record.get("notes") or (),
         warnings=[
-            *(run.record.get("notes") or ()),
             *provenance.resumptions(run.record),
             *run.problems,
             *shown.missing,
@@ -111,9 +111,15 @@ def build(run: Run, shown: Shown) -> str:
         meanings=MEANINGS,
         verdict=verdict(run.metrics),
         files=[(name, what) for name, what in FILES if (run.folder / name).is_file()],
-        overridden={override.lstrip("+~").split("=")[0] for override in run.overrides},
+        overridden=_given(run),
         plain=html.plain,
     )
+
+
+def _given(run: Run) -> set[str]:
+    """The configuration's keys that the user set: ``style=bubble`` sets ``style.name`` alone."""
+    keys = {override.lstrip("+~").split("=")[0] for override in run.overrides}
+    return keys | {f"{key}.name" for key in keys}
 
 
 def style_picture(style: Shape | np.ndarray | None) -> str | None:
@@ -154,13 +160,13 @@ def facts(run: Run, shown: Shown) -> list[tuple[str, str]]:
 
 
 def panels(run: Run, shown: Shown) -> list[dict[str, str]]:
-    """The meshes, side by side: key, title, and alternative text."""
+    """The meshes, the result first: key, title, and alternative text."""
     made = []
     source, style = run.part("source"), run.part("style")
     for key, title, alt in (
+        ("result", "Result", f"The source {source} with the local geometry of {style}"),
         ("source", f"Source: {source}", f"The source mesh {source}, before stylisation"),
         ("style", f"Style: {style}", f"The style {style}"),
-        ("result", "Result", f"The source {source} with the local geometry of {style}"),
     ):
         if getattr(shown, key) is not None:
             made.append({"key": key, "title": title, "alt": alt})

@@ -51,6 +51,10 @@ class Exemplar(Protocol):
         """Length of the whole exemplar."""
         ...
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All that the patches depend on."""
+        ...
+
     def sample(
         self, count: int, side: int, spacing: float, rng: np.random.Generator, any_way: bool
     ) -> tuple[Float[Tensor, "patches side side"], Places]:
@@ -79,6 +83,13 @@ class MeshExemplar:
     usual: Bool[np.ndarray, " vertices"] | None = None
     """Vertices where the relief is the pattern, not a rim or a flat base; None means all."""
     extent: float = 2.0
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """See `Exemplar`."""
+        sheet, usual = self.sheet, self.usual
+        given = {"vertices": sheet.vertices, "faces": sheet.faces, "normals": sheet.normals}
+        given |= {"height": self.height, "extent": np.array(self.extent)}
+        return given if usual is None else given | {"usual": usual}
 
     @cached_property
     def up(self) -> tuple[float, float, float]:
@@ -157,6 +168,10 @@ class PictureExemplar:
     height: Float[Tensor, "rows columns"]
     pixel: float
     """Side length of a pixel."""
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """See `Exemplar`."""
+        return {"height": self.height.numpy(), "pixel": np.array(self.pixel)}
 
     @property
     def extent(self) -> float:

@@ -15,7 +15,7 @@ from scipy.sparse import coo_matrix, diags
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import cg
 
-from styleexp.inputs import meshes
+from styleexp.inputs import measured, meshes
 from styleexp.method.relief import smoother
 from styleexp.method.synthesis.exemplar import MeshExemplar
 from styleexp.method.synthesis.walk import Sheet
@@ -59,11 +59,27 @@ def exemplar_of(mesh: meshes.Mesh, length: float | None = None) -> MeshExemplar 
     A single surface with few handles is smoothed along itself. With many components, inner faces or
     struts, the outer surface is extracted on a grid.
     """
+    given = {"vertices": mesh.vertices, "faces": mesh.faces}
+    found = measured.kept("relief", given, str(length), lambda: _arrays(_parted(mesh, length)))
+    if not found:
+        return None
+    sheet = Sheet(found["vertices"], found["faces"], found["normals"])
+    return MeshExemplar(sheet, found["height"], found["usual"])
+
+
+def _parted(mesh: meshes.Mesh, length: float | None) -> MeshExemplar | None:
     unit = meshes.normalisation(mesh.vertices).apply(mesh.vertices)
     mesh = _seen(meshes.Mesh(mesh.name, unit, mesh.faces))
     if len(_parts(mesh)) == 1 and _handles(mesh.faces) <= MOST_HANDLES:
         return _along_itself(mesh, length)
     return _outside(mesh, length or LENGTHS[0])
+
+
+def _arrays(exemplar: MeshExemplar | None) -> measured.Arrays:
+    """An exemplar's arrays, to be kept; none without relief."""
+    if exemplar is None:
+        return {}
+    return {name: each for name, each in exemplar.arrays().items() if name != "extent"}
 
 
 def _along_itself(mesh: meshes.Mesh, length: float | None) -> MeshExemplar | None:
