@@ -207,7 +207,7 @@ def test_sweep_page_opens_runs_sorts_and_shows_failures(runs, page):
     runs_table.find_element("xpath", ".//button[.='loss']").click()
     down = [float(value) for value in shown() if value]
     assert down == numbers[::-1]
-    page.find_element("css selector", ".entry a").click()
+    page.find_element("css selector", ".entry a[href^='0/']").click()
     wait(page, "document.getElementById('stage')?.dataset.shown")
     assert page.current_url == (runs / "sweep" / "0" / "report.html").as_uri()
     check_quiet(page)
