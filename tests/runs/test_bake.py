@@ -1,15 +1,18 @@
 """Baked maps against the meshes that they are of."""
 
 import json
+import re
 
+import imagecodecs
 import numpy as np
 import pytest
+from gpytoolbox import squared_distance
 from PIL import Image
 
 from styleexp.cli.bake import main
 from styleexp.config.compose import recorded
 from styleexp.inputs import meshes
-from styleexp.inputs.meshes import load_mesh, vertex_normals
+from styleexp.inputs.meshes import face_areas, load_mesh, vertex_normals
 from styleexp.runs import bake
 from styleexp.runs.origins import describe
 from tests.helpers import warm
@@ -17,11 +20,12 @@ from tests.helpers import warm
 SIZE = 256
 
 
-def grid(rows, columns, shape, mirrored=False):
-    """OBJ lines of a (rows x columns) patch with one UV island; ``shape`` maps u, v to a point."""
+def grid(rows, columns, shape, across=None):
+    """OBJ lines of a (rows x columns) patch with one UV island; ``shape`` maps u, v to a point, and
+    ``across`` u to what the file has for it."""
     u, v = np.meshgrid(np.linspace(0, 1, columns), np.linspace(0, 1, rows))
     points = np.stack(shape(u, v), axis=-1).reshape(-1, 3)
-    u = 1 - u if mirrored else u
+    u = across(u) if across else u
     lines = [f"v {x:.9f} {y:.9f} {z:.9f}" for x, y, z in points]
     lines += [f"vt {a:.9f} {b:.9f}" for a, b in zip(u.ravel(), v.ravel(), strict=True)]
     for i in range(rows - 1):
@@ -43,10 +47,20 @@ def plane(u, v):
     return u, v, 0 * u
 
 
-def write_run(folder, source, displacement, moved):
-    """A finished run's folder, of these numbers."""
+def flip(u):
+    """A mirrored texture."""
+    return 1 - u
+
+
+def fold(u):
+    """A texture that two halves share, one of them mirrored."""
+    return np.minimum(u, 1 - u)
+
+
+def write_run(folder, source, displacement, moved, path=None):
+    """A finished run's folder, of these numbers; ``path`` is the file that it was made from."""
     folder.mkdir()
-    path = folder.parent / f"{source.name}.obj"
+    path = path or folder.parent / f"{source.name}.obj"
     record = {
         "schema": 1,
         "config": {"source": {"path": str(path)}, "style": {"name": "bubble"}},
@@ -135,7 +149,7 @@ def test_the_normal_map_gives_the_results_normals(baked):
 
 def bump(tmp_path, mirrored):
     name = f"plane{mirrored}.obj"
-    (tmp_path / name).write_text(grid(33, 33, plane, mirrored))
+    (tmp_path / name).write_text(grid(33, 33, plane, flip if mirrored else None))
     source = load_mesh(tmp_path / name)
     x, y, _ = source.vertices.T
     height = 0.1 * np.exp(-((x - 0.5) ** 2 + (y - 0.5) ** 2) / 0.02)
@@ -211,3 +225,113 @@ def test_what_cannot_be_baked_is_said_in_one_sentence(tmp_path, capsys):
     assert "has no texture coordinates" in told(tmp_path / "run")
     assert "--size 3 is not allowed" in told(tmp_path / "run", "--size", 3)
     assert not (tmp_path / "run" / "bake").exists()
+
+
+# ---------------------------------------------------------------------------- onto another mesh
+
+
+def low_poly(folder, kind):
+    """The file of a coarse torus with everything that ``kind`` names: a format, ``mirrored`` or
+    ``folded`` texture coordinates, ``bare`` without any, ``textured``."""
+    across = {"mirrored": flip, "folded": fold}.get(kind.split("_")[0])
+    lines = grid(13, 25, torus, across)
+    if kind.startswith("bare"):
+        lines = re.sub(r"/\d+", "", re.sub(r"vt .*\n", "", lines))
+    if "textured" in kind:
+        Image.new("RGB", (8, 8), (200, 120, 40)).save(folder / "skin.png")
+        (folder / "low.mtl").write_text("newmtl skin\nKd 1 1 1\nmap_Kd skin.png\n")
+        lines = f"mtllib low.mtl\nusemtl skin\n{lines}"
+    (folder / "low.obj").write_text(lines)
+    if not kind.endswith("glb"):
+        return folder / "low.obj"
+    mesh = load_mesh(folder / "low.obj")
+    meshes.save_mesh(mesh, mesh.vertices, folder / "low.glb")
+    return folder / "low.glb"
+
+
+@pytest.fixture(scope="module")
+def detailed(tmp_path_factory):
+    """A fine torus with a relief that is symmetric in x, and in nothing else, and that run's
+    result."""
+    folder = tmp_path_factory.mktemp("detailed")
+    (folder / "fine.obj").write_text(grid(73, 145, torus))
+    mesh = load_mesh(folder / "fine.obj")
+    x, y, z = mesh.vertices.T
+    height = 0.03 * np.sin(9 * x**2 + 3) * np.cos(5 * z + 4 * y) + 0.01 * y
+    moved = mesh.vertices + height[:, None] * vertex_normals(mesh.vertices, mesh.faces)
+    return mesh, height, moved
+
+
+def read_maps(folder):
+    """The maps as another program reads them: height in units, the rest as stored in [0, 1]."""
+    told = json.loads((folder / "bake.json").read_text())
+    maps = {}
+    for name in ("height", "normal", "occlusion", "curvature"):
+        picture = imagecodecs.png_decode((folder / f"{name}.png").read_bytes())
+        assert picture.dtype == np.uint16
+        maps[name] = picture / 65535
+    coding = told["height"]
+    maps["height"] = coding["scale"] * (maps["height"] - coding["midlevel"])
+    return maps, told
+
+
+def compare(low, maps, vertices, faces):
+    """The low-poly mesh with its maps against a surface: RMS distance from it after moving by the
+    height map, as a fraction of that before, and mean angle in degrees between the normals that a
+    shader gets from the normal map and the surface's.
+
+    The shader finds its tangents by derivatives, as those do that are given none.
+    """
+    rng = np.random.default_rng(1)
+    corners = low.carrier.corners.copy()
+    corners[low.carrier.flipped] = corners[low.carrier.flipped][:, ::-1]
+    face = rng.choice(len(low.faces), 4000, p=(a := face_areas(low.vertices, low.faces)) / a.sum())
+    weights = rng.dirichlet([1, 1, 1], len(face))[:, :, None]
+
+    def unit(each):
+        return each / np.linalg.norm(each, axis=1, keepdims=True)
+
+    p, uv = low.vertices[low.faces[face]], low.carrier.uv[corners[face]]
+    at = (uv * weights).sum(axis=1)
+    normals = vertex_normals(low.vertices, low.faces)
+    n = unit((normals[low.faces[face]] * weights).sum(axis=1))
+    base = (p * weights).sum(axis=1)
+    moved = base + sample(maps["height"], at)[:, None] * n
+    before = squared_distance(base, vertices, faces, use_cpp=True)[0]
+    after, there, where = squared_distance(moved, vertices, faces, use_cpp=True)
+
+    (du1, dv1), (du2, dv2) = ((uv[:, k] - uv[:, 0]).T[:, :, None] for k in (1, 2))
+    area = du1 * dv2 - du2 * dv1
+    t = ((p[:, 1] - p[:, 0]) * dv2 - (p[:, 2] - p[:, 0]) * dv1) / area
+    t = unit(t - n * (t * n).sum(axis=1, keepdims=True))
+    m = sample(maps["normal"], at) * 2 - 1
+    shaded = m[:, :1] * t + m[:, 1:2] * np.cross(n, t) * np.sign(area) + m[:, 2:] * n
+    bent = vertex_normals(vertices, faces)[faces[there]]
+    wanted = unit((bent * where[:, :, None]).sum(axis=1))
+    angle = np.degrees(np.arccos(np.clip((unit(shaded) * wanted).sum(axis=1), -1, 1)))
+    plain = np.degrees(np.arccos(np.clip((n * wanted).sum(axis=1), -1, 1)))
+    return np.sqrt(after.mean() / before.mean()), angle.mean(), plain.mean()
+
+
+@pytest.mark.parametrize("kind", ["obj", "mirrored", "folded_glb", "bare", "textured_glb"])
+def test_the_low_poly_mesh_with_its_maps_is_the_result(kind, detailed, tmp_path, capsys):
+    """A height of the wrong sign, a flipped green channel, a shift by half a texel or a wrong
+    direction of v would show."""
+    pytest.importorskip("embreex", reason="Embree is not installed (extra bake)")
+    pytest.importorskip("xatlas", reason="xatlas is not installed (extra bake)")
+    path = low_poly(tmp_path, kind)
+    fine, height, moved = detailed
+    write_run(tmp_path / "run", fine, height, moved, path)
+    size = 256 if kind.startswith(("bare", "folded")) else 128
+    assert main([str(tmp_path / "run"), "--size", str(size)]) == 0
+    told = capsys.readouterr().err
+    assert ("has no texture coordinates: unwrapped" in told) == kind.startswith("bare"), told
+    assert ("is shared by several faces" in told) == kind.startswith("folded"), told
+    maps, told = read_maps(tmp_path / "run" / "bake")
+    assert told["filled_from_neighbours"] == 0
+    low = load_mesh(tmp_path / "run" / "bake" / "result_low.glb")
+    assert low.vertices.shape == load_mesh(path).vertices.shape
+    distance, angle, plain = compare(low, maps, moved, fine.faces)
+    assert distance < 0.06
+    assert angle < 0.8
+    assert plain > 7
