@@ -1,11 +1,14 @@
 """Baked maps against the meshes that they are of."""
 
+import io
 import json
 import re
+import sys
 
 import imagecodecs
 import numpy as np
 import pytest
+import trimesh
 from gpytoolbox import squared_distance
 from PIL import Image
 
@@ -15,7 +18,8 @@ from styleexp.inputs import meshes
 from styleexp.inputs.meshes import face_areas, load_mesh, vertex_normals
 from styleexp.runs import bake
 from styleexp.runs.origins import describe
-from tests.helpers import warm
+from tests.helpers import gltf_readers, warm
+from tests.helpers.needed import available
 
 SIZE = 256
 
@@ -31,7 +35,9 @@ def grid(rows, columns, shape, across=None):
     for i in range(rows - 1):
         for j in range(columns - 1):
             a = i * columns + j + 1
-            square = (a, a + 1, a + columns + 1, a + columns)
+            square = [a, a + 1, a + columns + 1, a + columns]
+            if across is fold and j >= columns // 2:
+                square = square[1:] + square[:1]  # the other diagonal, as in a mirrored mesh
             lines.append("f " + " ".join(f"{k}/{k}" for k in square))
     return "\n".join(lines)
 
@@ -313,12 +319,19 @@ def compare(low, maps, vertices, faces):
     return np.sqrt(after.mean() / before.mean()), angle.mean(), plain.mean()
 
 
+@pytest.fixture
+def rays():
+    """Skips without the extra ``bake``."""
+    pytest.importorskip("embreex", reason="Embree is not installed (extra bake)")
+    pytest.importorskip("xatlas", reason="xatlas is not installed (extra bake)")
+
+
+@pytest.mark.usefixtures("rays")
 @pytest.mark.parametrize("kind", ["obj", "mirrored", "folded_glb", "bare", "textured_glb"])
 def test_the_low_poly_mesh_with_its_maps_is_the_result(kind, detailed, tmp_path, capsys):
     """A height of the wrong sign, a flipped green channel, a shift by half a texel or a wrong
     direction of v would show."""
-    pytest.importorskip("embreex", reason="Embree is not installed (extra bake)")
-    pytest.importorskip("xatlas", reason="xatlas is not installed (extra bake)")
+    available(gltf_readers.tools)
     path = low_poly(tmp_path, kind)
     fine, height, moved = detailed
     write_run(tmp_path / "run", fine, height, moved, path)
@@ -331,7 +344,155 @@ def test_the_low_poly_mesh_with_its_maps_is_the_result(kind, detailed, tmp_path,
     assert told["filled_from_neighbours"] == 0
     low = load_mesh(tmp_path / "run" / "bake" / "result_low.glb")
     assert low.vertices.shape == load_mesh(path).vertices.shape
+    assert gltf_readers.errors(tmp_path / "run" / "bake" / "result_low.glb") == [[]]
     distance, angle, plain = compare(low, maps, moved, fine.faces)
     assert distance < 0.06
     assert angle < 0.8
     assert plain > 7
+
+
+def test_tangents_are_blenders():
+    """A fan whose quadrants are mirrored by turns: at its centre, two of equal handedness touch
+    without an edge between them, and all share one texture coordinate."""
+    a = np.arange(8) * np.pi / 4
+    rim = np.stack([np.cos(a), np.sin(a), 0.3 * np.sin(3 * a + 1)], axis=1)
+    points = np.vstack([[0, 0, 0.4], rim])
+    faces = np.stack([0 * np.arange(8), 1 + np.arange(8), 1 + (np.arange(8) + 1) % 8], axis=1)
+    flat = np.abs(points[:, :2])
+    uv = flat * [1, 0.8] + 0.1 * flat[:, ::-1]
+    normals = vertex_normals(points, faces)
+    found, sign = bake.tangents.tangents(points[faces], normals[faces], uv[faces])
+    assert sign.tolist() == [1, 1, -1, -1, 1, 1, -1, -1]
+    # Mesh.calc_tangents of Blender 5.0.1
+    theirs = """
+      .992 -.124 0     .980 -.111 -.163   .991 -.125 -.053   .992 -.124 0     .991 -.125 -.053
+      .972 -.190 -.139 -.992 -.124 0     -.928 -.171 .330   -.986 -.125 -.115 -.992 -.124 0
+     -.986 -.125 -.115 -.825 -.105 -.555 -.992 .124 0       -.841 .099 -.532  -.909 .114 -.401
+     -.992 .124 0     -.909 .114 -.401   -.968 .023 .250     .992 .124 0       .970 .018 -.241
+      .930 .128 -.345  .992 .124 0        .930 .128 -.345    .983 .137 -.123"""
+    np.testing.assert_allclose(found.ravel(), np.fromstring(theirs, sep=" "), atol=0.001)
+
+
+@pytest.mark.usefixtures("rays")
+def test_occlusion_and_curvature_of_a_pit_and_a_knob(tmp_path):
+    def shape(u, v):
+        bumps = [np.exp(-((u - c) ** 2 + (v - 0.5) ** 2) / 0.02) for c in (0.3, 0.7)]
+        return u, v, 0.1 * (bumps[1] - bumps[0])
+
+    (tmp_path / "low.obj").write_text(grid(2, 2, plane))
+    (tmp_path / "fine.obj").write_text(grid(81, 81, shape))
+    fine = load_mesh(tmp_path / "fine.obj")
+    maps = bake.bake_onto(
+        bake.low(load_mesh(tmp_path / "low.obj")), fine.vertices, fine.faces, 64, cage=0.3
+    )
+    pit, knob, plain = (32, 19), (32, 44), (8, 8)
+    assert maps.height[pit] == pytest.approx(-0.1, abs=0.002)
+    assert maps.height[knob] == pytest.approx(0.1, abs=0.002)
+    # At the bottom of z = d exp(-r^2 / s) both principal curvatures are 2 d / s.
+    assert maps.curvature[pit] == pytest.approx(-10, rel=0.1)
+    assert maps.curvature[knob] == pytest.approx(10, rel=0.1)
+    assert abs(maps.curvature[plain]) < 1
+    # From the bottom, the sky is open above the steepest line to the pit's wall.
+    r = np.linspace(0.01, 0.3, 300)
+    steepest = (0.1 * (1 - np.exp(-(r**2) / 0.02)) / r).max()
+    assert maps.occlusion[pit] == pytest.approx(1 / (1 + steepest**2), abs=0.02)
+    assert maps.occlusion[knob] == pytest.approx(1, abs=0.02)
+    assert maps.occlusion[plain] > 0.97
+    assert maps.told["cage"] == 0.3
+    # With a cage that ends on their flanks, pit and knob are filled from there, and it is said.
+    again = bake.bake_onto(
+        bake.low(load_mesh(tmp_path / "low.obj")), fine.vertices, fine.faces, 64, cage=0.05
+    )
+    assert 0.01 < again.told["filled_from_neighbours"] < 0.09
+    assert np.abs(again.height).max() <= 0.0501
+
+
+@pytest.mark.usefixtures("rays")
+def test_a_files_own_normals_are_baked_for(tmp_path):
+    """A cube with hard edges, onto itself: its map is flat. With smooth normals it would not be."""
+    cube = trimesh.creation.box()
+    hard = trimesh.Trimesh(cube.vertices[cube.faces].reshape(-1, 3), np.arange(36).reshape(-1, 3),
+                           process=False)  # fmt: skip
+    hard.visual = trimesh.visual.TextureVisuals(
+        uv=np.array(
+            [
+                [k % 6 / 6 + x, k // 6 / 2 + y]
+                for k in range(12)
+                for x, y in ((0, 0), (0.15, 0), (0, 0.45))
+            ]
+        )
+    )
+    content = hard.export(file_type="glb", include_normals=True)
+    (tmp_path / "cube.glb").write_bytes(content)
+    mesh = load_mesh(tmp_path / "cube.glb")
+    target = bake.low(mesh)
+    assert target.own
+    maps = bake.bake_onto(target, mesh.vertices, mesh.faces, 64)
+    inner = maps.covered & (np.abs(maps.height) < 1e-6)
+    assert inner.mean() > 0.3
+    # Its own smooth normals are at 55 degrees from the hard ones in the corners, 0 in the middle.
+    facing = mesh.vertices[mesh.faces]
+    assert facing.shape == (12, 3, 3)
+    flat = np.cross(facing[:, 1] - facing[:, 0], facing[:, 2] - facing[:, 0])
+    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+    np.testing.assert_allclose(target.normals, np.repeat(flat[:, None], 3, axis=1), atol=1e-6)
+
+
+@pytest.mark.usefixtures("rays")
+def test_the_sources_own_material_stays_in_the_low_poly_glb(detailed, tmp_path, capsys):
+    path = low_poly(tmp_path, "textured_glb")
+    fine, height, moved = detailed
+    write_run(tmp_path / "run", fine, height, moved, path)
+
+    def materials(*more):
+        options = ("--onto", path, "--size", 32, *more)
+        assert main([str(tmp_path / "run"), *map(str, options)]) == 0
+        tree, binary = gltf_readers.parts(tmp_path / "run" / "bake" / "result_low.glb")
+        (material,) = tree["materials"]
+        pictures = {}
+        for key, entry in (material | material["pbrMetallicRoughness"]).items():
+            if key.endswith("Texture"):
+                view = tree["bufferViews"][
+                    tree["images"][tree["textures"][entry["index"]]["source"]]["bufferView"]
+                ]
+                start = view.get("byteOffset", 0)
+                content = binary[start : start + view["byteLength"]]
+                pictures[key] = np.asarray(Image.open(io.BytesIO(content)))
+        return material["name"], pictures
+
+    name, pictures = materials()
+    assert name == "skin"
+    assert pictures["baseColorTexture"][0, 0].tolist() == [200, 120, 40]
+    maps, _ = read_maps(tmp_path / "run" / "bake")
+    np.testing.assert_allclose(pictures["normalTexture"] / 255, maps["normal"], atol=0.003)
+    np.testing.assert_allclose(pictures["occlusionTexture"] / 255, maps["occlusion"], atol=0.003)
+    capsys.readouterr()
+    _, pictures = materials("--unwrap")
+    assert "left out the textures" in capsys.readouterr().err
+    assert sorted(pictures) == ["normalTexture", "occlusionTexture"]
+
+
+@pytest.mark.usefixtures("rays")
+def test_what_cannot_be_baked_onto_is_said_in_one_sentence(detailed, tmp_path, capsys, monkeypatch):
+    path = low_poly(tmp_path, "obj")
+    fine, height, moved = detailed
+    write_run(tmp_path / "run", fine, height, moved, path)
+
+    def told(*options):
+        assert main([str(each) for each in (tmp_path / "run", "--size", 32, *options)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert not (tmp_path / "run" / "bake").exists()
+        return line
+
+    mesh = load_mesh(path)
+    for name, points in (("aside", mesh.vertices + 9), ("mm", mesh.vertices * 1000)):
+        meshes.save_mesh(mesh, points, tmp_path / f"{name}.obj")
+        assert f"'{name}' is not where the result is" in told("--onto", tmp_path / f"{name}.obj")
+    assert "does not exist" in told("--onto", tmp_path / "none.obj")
+    assert "--size 8193 is not allowed" in told("--onto", "source", "--size", 8193)
+    assert "--cage -1.0 is not allowed" in told("--cage", -1)
+    assert "--cage nan is not allowed" in told("--cage", "nan")
+    meshes.save_mesh(mesh, mesh.vertices * [1, 1.3, 1], tmp_path / "tall.obj")
+    assert "within reach" in told("--onto", tmp_path / "tall.obj", "--cage", 1e-9)
+    monkeypatch.setitem(sys.modules, "embreex", None)
+    assert "pip install 'styleexp[bake]'" in told()

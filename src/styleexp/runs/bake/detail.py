@@ -21,7 +21,7 @@ from styleexp.system.errors import UserError
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-RAYS = 128
+RAYS = 256
 """Rays per vertex for the occlusion."""
 SEED = 0
 OFF = 1e-4
@@ -29,7 +29,7 @@ OFF = 1e-4
 BACK = 1e-5
 """Distance behind its origin at which a ray to the surface starts, so that none slips through a
 surface that the origin lies on."""
-VERTICES = 2048
+VERTICES = 1024
 """Vertices per batch of occlusion."""
 
 A = TypeVar("A")

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
     from styleexp.inputs.meshes import Mesh
 
-ATLAS = 1024
+ATLAS = 512
 """Side that xatlas aims for, in its texels."""
-GUTTER = 4
-"""Texels of it between islands."""
+GUTTER = 2
+"""Texels of it between islands: 8 of a texture of 2048."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def unwrapped(mesh: Mesh) -> Mesh:
     middle, extent = mesh.vertices.mean(axis=0), np.ptp(mesh.vertices, axis=0).max()
     points = (mesh.vertices[carrier.rows] - middle) / extent
     atlas, pack = xatlas.Atlas(), xatlas.PackOptions()
-    pack.resolution, pack.padding = ATLAS, GUTTER
+    pack.resolution, pack.padding, pack.bruteForce = ATLAS, GUTTER, True
     atlas.add_mesh(points.astype(np.float32), carrier.corners.astype(np.uint32))
     atlas.generate(pack_options=pack)
     old, corners, uv = atlas[0]
