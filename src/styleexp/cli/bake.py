@@ -20,13 +20,15 @@ if TYPE_CHECKING:
 
 DESCRIPTION = """\
 Bake a finished run's result into maps for the mesh that it was made from, or another one in the
-same place: height, tangent-space normals (OpenGL, green is up) and, if that mesh has other vertices
-than the result, ambient occlusion and curvature, and result_low.glb, the mesh with its maps.
-bake.json describes their encoding."""
+same place: height, tangent-space normals (OpenGL, green is up), ambient occlusion and curvature;
+and result_low.glb, that mesh with its maps. bake.json describes their encoding. A source that was
+not refined gets height and normals only, without --onto."""
 FORMATS = ("png", "exr")
 SIZES = (16, 16384)
 MOST_ONTO = 8192
 """Largest side of maps of another mesh, which take 4 GB of memory."""
+LOST = 1e-3
+"""Fraction of texels without a value of their own that is worth a note."""
 SOURCE = "source"
 """Value of ``--onto`` for the run's own source."""
 
@@ -60,7 +62,10 @@ def bake(options: argparse.Namespace) -> list[Path]:
     if onto is None:
         try:
             source, vertices, displacement = shown.read_moved(folder)
-            maps = baking.bake(source, displacement, vertices, options.size)
+            if baking.has_coordinates(source):
+                maps = baking.bake(source, displacement, vertices, options.size)
+            else:
+                onto = SOURCE
         except shown.OtherVertices:
             onto = SOURCE
     if onto is not None:
@@ -123,9 +128,9 @@ def _onto(options: argparse.Namespace, onto: str) -> tuple[Mesh, baking.Maps, ba
         mesh = baking.unwrapped(mesh)
     low = baking.low(mesh)
     maps = baking.bake_onto(low, detail.vertices, detail.faces, options.size, options.cage)
-    if (lost := maps.told["filled_from_neighbours"]) > 0:
+    if (lost := maps.told["filled_from_neighbours"]) > LOST:
         _note(
-            f"{lost:.2%} of the texels have nothing of the result within {maps.told['cage']:.3g} "
+            f"{lost:.1%} of the texels have nothing of the result within {maps.told['cage']:.3g} "
             "and were filled from their neighbours (--cage changes the distance)."
         )
     return mesh, maps, low
@@ -156,8 +161,7 @@ def _parser() -> argparse.ArgumentParser:
         "--onto",
         metavar="source|FILE",
         help="the mesh to bake to: the one that the run was made from, as it was before it was "
-        "refined, or a file in the same place and units (needs the extra bake). Default: the "
-        "run's own source",
+        "refined (default), or a file in the same place and units; needs the extra bake",
     )
     parser.add_argument(
         "--cage",

@@ -185,7 +185,10 @@ class Detail:
         return total / np.maximum(around, 1e-12) / self.extent
 
 
-MISSING = "baking to another mesh than the run's own needs Embree: pip install 'styleexp[bake]'."
+MISSING = (
+    "this needs Embree and xatlas: pip install 'styleexp[bake]' (without, only a source that has "
+    "texture coordinates and was not refined can be baked to)."
+)
 
 
 def ahead(task: Callable[[A], B], given: Iterable[A]) -> Iterator[B]:

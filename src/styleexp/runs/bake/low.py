@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from styleexp.inputs.meshes import vertex_normals
-from styleexp.inputs.meshes.mesh import Carrier
-from styleexp.runs.bake.tangents import tangents
+from styleexp.inputs.meshes.mesh import Carrier, at_vertices
+from styleexp.runs.bake.tangents import tangents, unit
 from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
@@ -31,7 +31,8 @@ class Low:
     mesh: Mesh
     uv: Float[np.ndarray, "faces 3 2"]
     smooth: Float[np.ndarray, "vertices 3"]
-    """Unit normals along which heights are measured. They have no gaps at hard edges."""
+    """Unit normals along which heights are measured: means of those that the mesh is shaded with,
+    without gaps at hard edges."""
     rows: Float[np.ndarray, "rows 3"]
     """Unit normals of the file's rows that it is shaded with."""
     normals: Float[np.ndarray, "faces 3 3"]
@@ -55,6 +56,9 @@ def low(mesh: Mesh) -> Low:
         given = length[:, 0] > 0.5  # the filler of parts without normals is zero
         own = bool(given.any())
         rows = np.where(given[:, None], carrier.normals / np.maximum(length, 1e-12), rows)
+        mean = at_vertices(mesh, rows)
+        whole = np.linalg.norm(mean, axis=1, keepdims=True) > 0.1
+        smooth = unit(np.where(whole, mean, smooth))
     normals = rows[corners]
     frame, sign = tangents(mesh.vertices[mesh.faces], normals, uv[corners])
     return Low(mesh, uv[corners], smooth, rows, normals, frame, sign, own)
@@ -68,9 +72,9 @@ def coordinates(source: Mesh) -> tuple[Float[np.ndarray, "rows 2"], Int[np.ndarr
     carrier = source.carrier
     if carrier is None or carrier.uv is None or not has_coordinates(source):
         raise UserError(
-            f"the source '{source.name}' has no texture coordinates to bake to: let styleexp-bake "
-            "make them (--unwrap), or unwrap it yourself (in Blender: Edit Mode, UV > Smart UV "
-            "Project), export it as OBJ or GLB and run again."
+            f"the source '{source.name}' has no texture coordinates to bake to: unwrap it (in "
+            "Blender: Edit Mode, UV > Smart UV Project), export it as OBJ or GLB and run again; "
+            "or let styleexp-bake make them."
         )
     corners = carrier.corners.copy()
     corners[carrier.flipped] = corners[carrier.flipped][:, ::-1]
@@ -93,8 +97,8 @@ def unwrapped(mesh: Mesh) -> Mesh:
         import xatlas
     except ImportError:
         raise UserError(
-            f"'{mesh.name}' has no texture coordinates yet, and making them needs xatlas: pip "
-            "install 'styleexp[bake]', or unwrap it in the program that made it."
+            f"making texture coordinates for '{mesh.name}' needs xatlas: pip install "
+            "'styleexp[bake]', or unwrap it in the program that made it."
         ) from None
     carrier = mesh.carrier or Carrier(
         mesh.faces,
