@@ -26,7 +26,7 @@ not refined gets height and normals only, without --onto."""
 FORMATS = ("png", "exr")
 SIZES = (16, 16384)
 MOST_ONTO = 8192
-"""Largest side of maps of another mesh, which take 4 GB of memory."""
+"""Largest side of maps of another mesh, which take 5 GB of memory."""
 LOST = 1e-3
 """Fraction of texels without a value of their own that is worth a note."""
 SOURCE = "source"

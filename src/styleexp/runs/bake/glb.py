@@ -53,7 +53,8 @@ def _ready(low: Low) -> Mesh:
     """The mesh, with a material, and without a document that has other normals or windings."""
     mesh, carrier = low.mesh, low.mesh.carrier
     assert carrier is not None
-    if carrier.document is not None and low.own:
+    document = carrier.document
+    if low.own and document and all("NORMAL" in each.attributes for each in document.blocks):
         return mesh
     corners = np.where(carrier.flipped[:, None], carrier.corners[:, ::-1], carrier.corners)
     carrier = replace(carrier, document=None, corners=corners, flipped=np.zeros(len(corners), bool))
