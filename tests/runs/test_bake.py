@@ -419,7 +419,7 @@ def test_a_files_own_normals_are_baked_for(tmp_path):
     (tmp_path / "cube.glb").write_bytes(hard.export(file_type="glb", include_normals=True))
     target = bake.low(load_mesh(tmp_path / "cube.glb"))
     assert target.own
-    maps = bake.bake_onto(target, cube.vertices, cube.faces, 256)
+    maps = bake.bake_onto(target, cube.vertices, cube.faces, 256, cage=0.1)
     assert np.abs(maps.height).max() < 1e-4
     read = {"height": maps.height, "normal": maps.normal / 2 + 0.5}
     with np.errstate(invalid="ignore", divide="ignore"):  # it is the same surface

@@ -89,9 +89,7 @@ def _check(options: argparse.Namespace) -> None:
     """Raise `UserError` for what can be told from the options alone."""
     if not options.folder.is_dir():
         raise UserError(f"there is no folder '{options.folder}': give a run's folder.")
-    most = SIZES[1] if options.onto is None else MOST_ONTO
-    if not SIZES[0] <= options.size <= most:
-        raise UserError(f"--size {options.size} is not allowed: give {SIZES[0]} to {most} pixels.")
+    _check_size(options.size, SIZES[1])
     if options.cage is not None and not (options.cage > 0 and math.isfinite(options.cage)):
         raise UserError(
             f"--cage {options.cage} is not allowed: give a distance above 0, in the mesh's units."
@@ -102,12 +100,18 @@ def _check(options: argparse.Namespace) -> None:
         )
 
 
+def _check_size(size: int, most: int) -> None:
+    if not SIZES[0] <= size <= most:
+        raise UserError(f"--size {size} is not allowed: give {SIZES[0]} to {most} pixels.")
+
+
 def _onto(options: argparse.Namespace, onto: str) -> tuple[Mesh, baking.Maps, baking.Low]:
     """The mesh to bake to, its maps, and the mesh as it was baked to."""
     from styleexp.inputs.meshes import from_arrays, load_mesh
     from styleexp.runs import bake as baking
     from styleexp.runs import origins, reading, results
 
+    _check_size(options.size, MOST_ONTO)
     if find_spec("embreex") is None:
         raise UserError(baking.MISSING)
     path = options.folder / results.NAME
@@ -120,6 +124,7 @@ def _onto(options: argparse.Namespace, onto: str) -> tuple[Mesh, baking.Maps, ba
         detail = from_arrays(stored.vertices, stored.faces)
     except UserError as error:
         raise UserError(f"'{path}' {error}") from None
+    room = baking.cage(mesh, detail.vertices, detail.faces)
     if options.unwrap or not baking.has_coordinates(mesh):
         if not options.unwrap:
             _note(f"'{mesh.name}' has no texture coordinates: unwrapped it, see result_low.glb.")
@@ -127,10 +132,11 @@ def _onto(options: argparse.Namespace, onto: str) -> tuple[Mesh, baking.Maps, ba
             _note("left out the textures, which belong to the replaced texture coordinates.")
         mesh = baking.unwrapped(mesh)
     low = baking.low(mesh)
-    maps = baking.bake_onto(low, detail.vertices, detail.faces, options.size, options.cage)
+    room = room if options.cage is None else options.cage
+    maps = baking.bake_onto(low, detail.vertices, detail.faces, options.size, room)
     if (lost := maps.told["filled_from_neighbours"]) > LOST:
         _note(
-            f"{lost:.1%} of the texels have nothing of the result within {maps.told['cage']:.3g} "
+            f"{lost:.1%} of the texels have nothing of the result within {room:.3g} "
             "and were filled from their neighbours (--cage changes the distance)."
         )
     return mesh, maps, low

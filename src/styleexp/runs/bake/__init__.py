@@ -39,10 +39,13 @@ if TYPE_CHECKING:
 
 INSIDE = 1e-3
 """Barycentric distance to an edge below which a texel doesn't count as overlap."""
-APART = 0.1
-"""Distance, in diagonals of the result, above which a mesh is not where the result is."""
+APART = 0.05
+"""Median distance, in diagonals of the result, above which a mesh is not where the result is.
+Reliefs reach 0.01."""
 ROOM = 1.5
 """The cage's distance, in greatest distances of the result from the mesh."""
+CAGES = (0.001, 0.1)
+"""Least and greatest cage that is chosen so, in diagonals of the result."""
 
 
 @dataclass(frozen=True)
@@ -88,28 +91,52 @@ def bake(
     return Maps(drawn[..., 0], drawn[..., 1:4], covered, overlap)
 
 
+def cage(
+    mesh: Mesh,
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+) -> float:
+    """How far from a mesh to look for a detailed surface, in the mesh's units.
+
+    Raises `UserError` if the mesh is somewhere else.
+    """
+    low, detail = Detail(mesh.vertices, mesh.faces), Detail(vertices, faces)
+    diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    probes = np.concatenate([mesh.vertices, mesh.vertices[mesh.faces].mean(axis=1)])
+    apart = float(np.median(detail.distances(detail.own(probes)))) * detail.extent
+    if apart > APART * diagonal:
+        places = []
+        for each in (low, detail):
+            x, y, z = each.middle
+            places.append(f"{each.extent:.4g} large at ({x:.4g}, {y:.4g}, {z:.4g})")
+        raise UserError(
+            f"'{mesh.name}' is not where the result is: half of it is more than {apart:.3g} away "
+            f"({places[0]}, the result {places[1]}): give a mesh in the same place and units."
+        )
+    least, most = (each * diagonal for each in CAGES)
+    return float(np.clip(ROOM * low.distances(low.own(vertices)).max() * low.extent, least, most))
+
+
 def bake_onto(
     target: Low,
     vertices: Float[np.ndarray, "vertices 3"],
     faces: Int[np.ndarray, "faces 3"],
     size: int,
-    cage: float | None = None,
+    cage: float,
 ) -> Maps:
     """Bake a detailed surface, ``vertices`` and ``faces``, into the texture coordinates of another
-    mesh in the same place, `low` of it.
+    mesh, `low` of it, in the same place.
 
     From every texel's point on the mesh a ray goes along its smooth normal, outwards and inwards,
     up to the distance ``cage``, in the mesh's units, to the surface that faces the same way. Where
     none does, the nearest point of the surface within that distance counts.
 
-    Raises `UserError` for a mesh in another place, and without Embree.
+    Raises `UserError` if Embree is missing.
     """
     mesh, detail = target.mesh, Detail(vertices, faces)
-    own = detail.own(mesh.vertices)
-    reach = _reach(mesh, own, detail)
-    reach = reach if cage is None else cage / detail.extent
+    reach = cage / detail.extent
     columns = np.column_stack([detail.normals, detail.occlusion(), detail.curvature()])
-    ends = np.column_stack([own, target.smooth]).astype(np.float32)
+    ends = np.column_stack([detail.own(mesh.vertices), target.smooth]).astype(np.float32)
     nearest: list[int] = []
 
     def met(each: Texels) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -125,35 +152,13 @@ def bake_onto(
 
     drawn, covered, overlap, missed = _drawn(target, faces, columns, met, size)
     told = {
-        "cage": reach * detail.extent,
+        "cage": cage,
         "normals": "the file's own" if target.own else "smooth",
         "nearest_instead_of_ray": sum(nearest) / max(1, missed + int(covered.sum())),
         "filled_from_neighbours": missed / max(1, missed + int(covered.sum())),
     }
     maps = (drawn[..., 0], drawn[..., 1:4], covered, overlap, drawn[..., 4], drawn[..., 5])
     return Maps(*maps, told)
-
-
-def _reach(mesh: Mesh, own: Float[np.ndarray, "vertices 3"], detail: Detail) -> float:
-    """Distance up to which rays look for the surface, in the frame of ``detail``, in which the
-    mesh's vertices are ``own``. Raises `UserError` if the mesh is somewhere else."""
-    most = APART * float(np.linalg.norm(np.ptp(detail.vertices, axis=0)))
-    apart = detail.distances(np.concatenate([own, own[mesh.faces].mean(axis=1)]))
-    if (middle := float(np.median(apart))) > most:
-        places = []
-        for points in (mesh.vertices, detail.vertices * detail.extent + detail.middle):
-            x, y, z = (points.min(axis=0) + points.max(axis=0)) / 2
-            places.append(
-                f"{np.ptp(points, axis=0).max():.4g} large at ({x:.4g}, {y:.4g}, {z:.4g})"
-            )
-        raise UserError(
-            f"'{mesh.name}' is not where the result is: half of it is more than "
-            f"{middle * detail.extent:.3g} away ({places[0]}, the result {places[1]}): give a mesh "
-            "in the same place and units."
-        )
-    there = Detail(mesh.vertices, mesh.faces)
-    back = there.distances(there.own(detail.vertices * detail.extent + detail.middle))
-    return float(np.clip(ROOM * back.max() * there.extent / detail.extent, most / 100, most))
 
 
 def _drawn(

@@ -31,6 +31,8 @@ BACK = 1e-5
 surface that the origin lies on."""
 VERTICES = 1024
 """Vertices per batch of occlusion."""
+THREADS = 8
+"""Most batches at a time, each of about 100 MB."""
 
 A = TypeVar("A")
 B = TypeVar("B")
@@ -193,12 +195,13 @@ MISSING = (
 
 def ahead(task: Callable[[A], B], given: Iterable[A]) -> Iterator[B]:
     """Results of a task in order, computed by several threads, a few ahead of the one wanted."""
-    threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    threads = min(usable or 1, THREADS)
     pending: list[Future[B]] = []
     with ThreadPoolExecutor(threads) as pool:
         for each in given:
             pending.append(pool.submit(task, each))
-            if len(pending) > (threads or 1):
+            if len(pending) > threads:
                 yield pending.pop(0).result()
         for future in pending:
             yield future.result()
