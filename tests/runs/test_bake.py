@@ -478,6 +478,8 @@ def test_what_cannot_be_baked_onto_is_said_in_one_sentence(detailed, tmp_path, c
     for name, points in (("aside", mesh.vertices + 9), ("mm", mesh.vertices * 1000)):
         meshes.save_mesh(mesh, points, tmp_path / f"{name}.obj")
         assert f"'{name}' is not where the result is" in told("--onto", tmp_path / f"{name}.obj")
+    meshes.save_mesh(mesh, mesh.vertices * 1e-40, tmp_path / "tiny.obj")
+    assert "scale the mesh" in told("--onto", tmp_path / "tiny.obj")
     assert "does not exist" in told("--onto", tmp_path / "none.obj")
     assert "--size 8193 is not allowed" in told("--onto", "source", "--size", 8193)
     assert "--cage -1.0 is not allowed" in told("--cage", -1)

@@ -73,7 +73,7 @@ def bake(options: argparse.Namespace) -> list[Path]:
     _warn(source, maps)
     target = options.out or folder / "bake"
     target.mkdir(parents=True, exist_ok=True)
-    record = {"run": str(folder), "source": source.name}
+    record = {"run": str(folder), "source" if onto in (None, SOURCE) else "mesh": source.name}
     if onto is not None:
         record["onto"] = onto
     told = baking.write(maps, target, options.format)

@@ -98,9 +98,13 @@ def cage(
 ) -> float:
     """How far from a mesh to look for a detailed surface, in the mesh's units.
 
-    Raises `UserError` if the mesh is somewhere else.
+    Raises `UserError` if the mesh is somewhere else, or beyond single precision.
     """
     low, detail = Detail(mesh.vertices, mesh.faces), Detail(vertices, faces)
+    if not 1e-30 < min(low.extent, detail.extent) <= max(low.extent, detail.extent) < 1e30:
+        raise UserError(
+            f"'{mesh.name}' is {low.extent:.3g} large, which maps can't hold: scale the mesh."
+        )
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     probes = np.concatenate([mesh.vertices, mesh.vertices[mesh.faces].mean(axis=1)])
     apart = float(np.median(detail.distances(detail.own(probes)))) * detail.extent
