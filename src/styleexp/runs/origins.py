@@ -19,6 +19,8 @@ from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
     from styleexp.config.schema import Config
+    from styleexp.inputs.meshes import Mesh
+    from styleexp.runs.reading import Run
 
 
 def describe(config: Config) -> dict[str, dict[str, str | None]]:
@@ -119,6 +121,23 @@ def find(
     where = "" if named.is_absolute() else f" (looked for in '{Path.cwd()}')"
     what = "has changed since the run began" if there else "is missing"
     raise UserError(f"its {kind} '{named}' {what}{where}: restore it, or start the run again.")
+
+
+def source(run: Run) -> Mesh:
+    """The mesh that a run was made from, as its file has it: neither remeshed nor refined.
+
+    Raises `UserError` if it is missing or has changed.
+    """
+    from styleexp.config import compose
+
+    config = compose.recorded(run.record.get("config"))
+    try:
+        if path := find(run.record, config, "source", run.folder):
+            config.source.path = str(path)
+    except UserError as error:
+        raise UserError(f"'{run.folder}' can't be used: {error}") from None
+    config.source.remesh = None
+    return sources.load_source(config.source)
 
 
 def _candidates(named: Path, kind: str, part: Any, folder: Path) -> Iterator[Path]:

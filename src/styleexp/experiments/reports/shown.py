@@ -117,10 +117,14 @@ def read(run: Run) -> Shown:
     return Shown(**found, radius=frame.scale if frame else 1.0, missing=tuple(missing))
 
 
+class OtherVertices(UserError):
+    """A result whose vertices are not its source's."""
+
+
 def read_moved(folder: Path) -> tuple[meshes.Mesh, np.ndarray, np.ndarray]:
     """A finished run's source, moved vertices (vertices, 3), and displacement (vertices,).
 
-    Raises `UserError` if they are unavailable.
+    Raises `UserError` if they are unavailable, and `OtherVertices` if the result has others.
     """
     from styleexp.inputs.meshes.writing import ply_rows
 
@@ -142,10 +146,9 @@ def read_moved(folder: Path) -> tuple[meshes.Mesh, np.ndarray, np.ndarray]:
         or len(stored.vertices) != len(rows)
         or not np.array_equal(stored.faces, corners)
     ):
-        raise UserError(
-            f"'{path}' has other vertices than its source '{source.name}' (as baseline="
-            "geometric_textures makes them, which resamples it), so its displacement is not of "
-            "the source."
+        raise OtherVertices(
+            f"'{path}' has other vertices than its source '{source.name}' (it was refined, or "
+            "resampled by baseline=geometric_textures), so its displacement is not of the source."
         )
     moved, displacement = np.zeros_like(source.vertices), np.zeros(len(source.vertices))
     moved[rows], displacement[rows] = stored.vertices, stored.displacement

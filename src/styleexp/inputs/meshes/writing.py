@@ -106,6 +106,17 @@ def save_mesh(
         raise UserError(f"'{path}' cannot be written ({error.strerror or error}).") from None
 
 
+def glb_as_it_is(mesh: Mesh, normals: Float[np.ndarray, "rows 3"]) -> bytes:
+    """A GLB of a mesh that was not moved, with these unit normals of its rows; a glTF input's
+    document keeps its own."""
+    carrier = mesh.carrier
+    assert carrier is not None
+    points = mesh.vertices[carrier.rows]
+    if carrier.document is not None:
+        return glb_of(carrier, points, np.zeros(len(points), bool), normals, None)
+    return new_glb(carrier, list(_runs(carrier)), points, normals, None)
+
+
 def _row_normals(carrier: Carrier, vertices: np.ndarray) -> np.ndarray:
     """Unit normals (rows, 3), smooth across corners that the file's normals mark as smooth."""
     groups = carrier.rows
