@@ -14,7 +14,16 @@ PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 GUIDES = ("gentle", "mean_vgg", "waves", "moments", "my_baseline", "my_renderer")
 """Parts that guides have their reader write; the guides' own tests run them."""
 FILES = (
-    *("my.obj", "low.obj", "my.glb", "my_head.obj", "head.obj", "coarse.stl", "her.ply", "bark.jpg"),
+    *(
+        "my.obj",
+        "low.obj",
+        "my.glb",
+        "my_head.obj",
+        "head.obj",
+        "coarse.stl",
+        "her.ply",
+        "bark.jpg",
+    ),
     *("bark.png", "peeling.jpg", "height.png", "normal.png", "outputs/upper/result.ply"),
 )
 """The reader's files."""
