@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 FORMATS = ("PNG", "GIF")
 """Accepted formats of a run's pictures; others could make Pillow start external programs."""
 GZIP_LEVEL = 6
-THUMBNAIL = 200
+THUMBNAIL = 300
 """Longer side of a sweep's thumbnails in pixels."""
 
 

@@ -19,6 +19,11 @@ from styleexp.runs.records import RunFolder
 from styleexp.system.errors import UserError
 
 NAME = "report.html"
+FIRST = (
+    *("loss", "match", "craft", "likeness", "coverage", "style_distance", "silhouette_iou"),
+    "flipped_faces",
+)
+"""Measures whose columns are shown at first."""
 SPARSE = 4
 """Cells per run above which a grid isn't shown."""
 ABREAST = 5
@@ -153,6 +158,7 @@ def build(folder: Path, runs: list[Run]) -> str:
         links={run.folder: _link(run, folder) for run in runs},
         searched={run.folder: searched(run) for run in runs},
         measures={sweep.name: measures(sweep) for sweep in sweeps},
+        first=FIRST,
         plots={sweep.name: plots(sweep) for sweep in sweeps},
         comparisons={sweep.name: comparisons(sweep) for sweep in sweeps},
         better=comparison.BETTER,

@@ -36,6 +36,22 @@ for (const section of document.querySelectorAll("section")) {
   show();
 }
 
+// Columns of measurements that are chosen; the others are hidden, not left out.
+for (const section of document.querySelectorAll("section")) {
+  const choices = [...section.querySelectorAll(".columns input")], table = section.querySelector("table.runs");
+  const heads = [...(table?.tHead.rows[0].cells ?? [])].map((head) => head.textContent.trim());
+  const show = () => {
+    for (const choice of choices) {
+      const column = heads.indexOf(choice.value);
+      for (const row of table.rows) {
+        if (row.cells.length === heads.length) row.cells[column].hidden = !choice.checked;
+      }
+    }
+  };
+  for (const choice of choices) choice.addEventListener("change", show);
+  show();
+}
+
 // Rows with the same value of a column, together in a body of their own, below its name.
 for (const section of document.querySelectorAll("section")) {
   const choice = section.querySelector("select.group"), table = section.querySelector("table.runs");
