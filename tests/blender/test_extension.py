@@ -104,7 +104,7 @@ def suzanne():
 
 
 def stylize():
-    return bpy.ops.object.styleexp_stylize()
+    return bpy.ops.object.styleexp_stylize("EXEC_DEFAULT", True)  # with a step to undo
 
 
 def uncovered(thing):
