@@ -8,6 +8,7 @@ import importlib.util
 import os
 import runpy
 import shutil
+import subprocess
 import sys
 import tempfile
 import threading
@@ -314,6 +315,137 @@ def test_cancel_leaves_the_scene_as_it_was(suzanne, tmp_path):
     thread.join()
     assert time.monotonic() - begun < 30
     assert list((tmp_path / "runs").iterdir()) == []
+
+
+class Shown:
+    """Takes the place of a layout, a window or an operator, and notes what it is asked for."""
+
+    def __init__(self, **given):
+        self.told = []
+        self.__dict__ |= given
+
+    def prop(self, owner, name, **more):
+        assert name in owner.bl_rna.properties
+        self.told.append(name)
+
+    def prop_search(self, owner, name, data, collection, **more):
+        assert hasattr(data, collection)
+        self.prop(owner, name)
+
+    def operator(self, name, **more):
+        group, _, word = name.partition(".")
+        assert word in dir(getattr(bpy.ops, group))
+        self.told.append(name)
+
+    def label(self, text="", **more):
+        self.told.append(text)
+
+    progress = label
+
+    def column(self, **more):
+        return self
+
+    def report(self, kinds, text):
+        self.told.append((*kinds, text))
+
+    def status_text_set(self, text):
+        self.told.append(text)
+
+    def event_timer_remove(self, timer):
+        self.told.append(timer)
+
+
+def drawn(thing):
+    panel, layout = sys.modules[f"{NAME}.panel"], Shown()
+    panel.VIEW3D_PT_styleexp.draw(Shown(layout=layout), Shown(object=thing))
+    return layout.told
+
+
+def test_with_a_window_blender_stays_usable(suzanne, preferences, tmp_path):
+    """What Blender would call: there is no window here, so the events are made up."""
+    work, operators = (sys.modules[f"{NAME}.{each}"] for each in ("work", "operators"))
+    kind = operators.OBJECT_OT_styleexp_stylize
+    thing, choice = suzanne, suzanne.styleexp
+    assert {"style_name", "mask", "object.styleexp_stylize"} <= set(drawn(thing))
+    assert drawn(None) == ["Select a mesh object"]
+    layout = Shown()
+    sys.modules[f"{NAME}.panel"].StyleexpPreferences.draw(
+        Shown(layout=layout, executable="", folder="", bl_rna=preferences.bl_rna), None
+    )
+    assert layout.told == ["executable", "preferences.styleexp_check", "folder"]
+
+    context = Shown(workspace=Shown(), window_manager=Shown(windows=[]))
+
+    def begun():
+        work.begin(bpy.context, thing)
+        assert not bpy.ops.object.styleexp_stylize.poll()
+        self = Shown(_timer="timer")
+        self._finish, self._clear = (
+            lambda at: kind._finish(self, at),
+            lambda at: kind._clear(self, at),
+        )
+        return self
+
+    def event(self, name="TIMER", value="NOTHING"):
+        return kind.modal(self, context, Shown(type=name, value=value))
+
+    def until(self, ends):
+        deadline = time.monotonic() + 200
+        while (now := event(self)) == {"PASS_THROUGH"} and not ends():
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        return now
+
+    choice.refine = "none"
+    self = begun()
+    assert event(self, "MOUSEMOVE") == {"PASS_THROUGH"}
+    assert drawn(thing)[0] == thing.name
+    assert drawn(thing)[-1] == "object.styleexp_cancel"
+    # The result waits for the end of an edit mode.
+    own = points(thing)
+    bpy.ops.object.mode_set(mode="EDIT")
+    assert until(self, lambda: work.current.ended() and event(self)) == {"PASS_THROUGH"}
+    assert "leave the mode" in context.workspace.told[-1]
+    bpy.ops.object.mode_set(mode="OBJECT")
+    np.testing.assert_array_equal(points(thing), own)
+    assert event(self) == {"FINISHED"}
+    assert not np.array_equal(points(thing), own)
+    assert context.workspace.told[-1] is None
+    assert context.window_manager.told == ["timer"]
+    assert "stack" in drawn(thing)
+    assert bpy.ops.object.styleexp_restore() == {"FINISHED"}
+
+    # Esc; a mistake; a mesh that was changed meanwhile, one that was removed.
+    self = begun()
+    assert event(self, "ESC", "PRESS") == {"RUNNING_MODAL"}
+    assert until(self, lambda: False) == {"CANCELLED"}
+    assert self.told == [("INFO", "styleexp was stopped")]
+    choice.style_name = "bubbel"
+    self = begun()
+    assert until(self, lambda: False) == {"CANCELLED"}
+    assert self.told[0][0] == "ERROR"
+    assert "unknown style 'bubbel'" in self.told[0][1]
+    np.testing.assert_array_equal(points(thing), own)
+    assert list(bpy.data.meshes) == [thing.data]
+    for change, told in (("move", "was changed while styleexp ran"), ("remove", "is gone")):
+        self = begun()
+        work.current.process.end()
+        work.current.process = Shown(poll=lambda: 0, stopped=False, lines=[], end=lambda: None)
+        if change == "move":
+            thing.data.shape_keys.reference_key.data[0].co.x += 1
+        else:
+            bpy.data.objects.remove(thing)
+        assert event(self) == {"CANCELLED"}
+        assert told in self.told[0][1]
+
+
+def test_blenders_own_tool_finds_the_zip_valid(tmp_path):
+    archive = runpy.run_path(str(ROOT / "blender" / "build.py"))["build"](tmp_path)
+    tool = Path(bpy.utils.system_resource("SCRIPTS")) / "addons_core/bl_pkg/cli/blender_ext.py"
+    done = subprocess.run(
+        [sys.executable, tool, "validate", archive], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_check_tells_where_the_command_is(preferences, tmp_path):
