@@ -2,8 +2,8 @@
 
     STYLEEXP_COMMAND=.venv/bin/styleexp .venv-bpy/bin/python blender/picture.py out.png
 
-Needs .venv-bpy (`make blender-test`). A second argument is a folder to keep the run in. The one in the
-documentation was then cropped to 505 rows, made 960 wide and rounded to 7 bits, for 260 kB.
+Needs .venv-bpy (`make blender-test`). A second argument is a folder to keep the run in. The one in
+the documentation was then cropped to 505 rows, made 960 wide and rounded to 7 bits, for 260 kB.
 """
 
 from __future__ import annotations
