@@ -68,7 +68,7 @@ class Settings:
 
 
 def overrides(settings: Settings) -> list[str]:
-    """The overrides of everything that differs from the command's defaults."""
+    """The overrides of what differs from the command's defaults, and the further ones."""
     plain = Settings("")
     found = []
     if settings.strength != plain.strength:
@@ -83,8 +83,6 @@ def overrides(settings: Settings) -> list[str]:
         found.append("style.invert=true")
     if settings.seed != plain.seed:
         found.append(f"optim.seed={settings.seed}")
-    if settings.refine != plain.refine:
-        found.append(f"source.refine={settings.refine}")
     return [*found, *further(settings.more)]
 
 
@@ -109,10 +107,14 @@ def further(text: str) -> list[str]:
 
 def words(executable: str, settings: Settings) -> list[str]:
     """The command, to be run in the job's folder."""
+    if settings.style.startswith("-"):
+        raise ExtensionError(f"'{settings.style}' is not a style: give a name or a file.")
     given = overrides(settings)
     keys = {each.partition("=")[0].lstrip("+") for each in given}
-    quick = [each for each in QUICK if each.partition("=")[0] not in keys]
-    return [executable, SOURCE, settings.style, *quick, *given, f"hydra.run.dir={RUN}"]
+    # Said in any case, because methods differ in what they do by default.
+    ours = [*QUICK, f"source.refine={settings.refine}"]
+    plain = [each for each in ours if each.partition("=")[0] not in keys]
+    return [executable, SOURCE, settings.style, *plain, *given, f"hydra.run.dir={RUN}"]
 
 
 # --------------------------------------------------------------------------------- the executable

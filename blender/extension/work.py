@@ -31,7 +31,7 @@ class Work:
         self.original = (again if again and not choice.stack else thing.data).name
         settings = choice.settings()
         executable = command.executable(bpy.path.abspath(preferences.executable))
-        command.overrides(settings)  # before anything is written
+        words = command.words(executable, settings)  # before anything is written
         self.mask = choice.mask
         self.source = self._read(thing)
         self.folder = _folder(preferences.folder, thing.name)
@@ -39,7 +39,7 @@ class Work:
             surface.write_source(self.folder / command.SOURCE, self.source)
             if choice.style_from == "OBJECT":
                 exchange.write_shape(choice.style_object, self.folder / command.STYLE)
-            self.process = command.Process(command.words(executable, settings), self.folder)
+            self.process = command.Process(words, self.folder)
         except (OSError, ExtensionError) as error:
             shutil.rmtree(self.folder, ignore_errors=True)
             if isinstance(error, OSError):

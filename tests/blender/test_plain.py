@@ -38,6 +38,10 @@ def test_words_leave_the_artists_overrides_the_last_say():
     assert words[:3] == ["styleexp", "source.ply", "/my styles/a=b.jpg"]
     assert "report=false" not in words
     assert words[-4:] == ["source.refine=none", "report=true", "field.x=a b", "hydra.run.dir=run"]
+    own = command.words("styleexp", command.Settings("scales", more="source.refine=9000"))
+    assert [each for each in own if "refine" in each] == ["source.refine=9000"]
+    with pytest.raises(Fault, match="'--help' is not a style"):
+        command.words("styleexp", command.Settings("--help"))
 
 
 @pytest.mark.parametrize(
