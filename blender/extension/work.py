@@ -54,9 +54,14 @@ class Work:
         original = bpy.data.meshes.get(self.original)
         if original is None or original == shown:
             return exchange.source_of(thing, self.mask)
-        # The vertex groups' names are the mesh's.
+        # Vertex groups belong to the mesh.
         thing.data = original
         try:
+            if self.mask and self.mask not in thing.vertex_groups:
+                raise ExtensionError(
+                    f"the original mesh of '{self.name}' has no vertex group '{self.mask}': "
+                    "restore the original, and make the group there."
+                )
             return exchange.source_of(thing, self.mask)
         finally:
             thing.data = shown

@@ -413,6 +413,15 @@ def test_with_a_window_blender_stays_usable(suzanne, preferences, tmp_path):
     assert context.workspace.told[-1] is None
     assert context.window_manager.told == ["timer"]
     assert "stack" in drawn(thing)
+    thing.vertex_groups.new(name="late")
+    choice.mask = "late"
+    now = points(thing)
+    with pytest.raises(
+        RuntimeError, match=r"original mesh of .* has no vertex group 'late': restore"
+    ):
+        stylize()
+    np.testing.assert_array_equal(points(thing), now)
+    choice.mask = ""
     assert bpy.ops.object.styleexp_restore() == {"FINISHED"}
 
     # Esc; a mistake; a mesh that was changed meanwhile, one that was removed.
