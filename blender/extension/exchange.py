@@ -191,18 +191,23 @@ def _put_displacement(mesh, values):
 
 
 def _put_attributes(mesh, before, source, found):
-    """UV maps, colours, materials, shading and all other attributes of points, corners, faces."""
-    at = {"POINT": found.of_vertices, "CORNER": found.of_corners, "FACE": found.of_faces}
+    """UV maps, colours, materials, shading, seams and all other attributes."""
+    ends = [column(each.edges, "vertices", (2,), np.int32) for each in (before, mesh)]
+    pieces = found.of_edges(source, *ends)
+    at = {
+        "POINT": lambda values: found.of_vertices(source, values),
+        "CORNER": lambda values: found.of_corners(source, values),
+        "FACE": lambda values: found.of_faces(source, values),
+        # What an edge inside of a polygon has: nothing.
+        "EDGE": lambda values: (values[pieces].T * (pieces >= 0)).T.astype(values.dtype),
+    }
     for name in [each.name for each in before.attributes]:
         given = before.attributes[name]
-        if (
-            name.startswith(".")
-            or name in OWN
-            or given.domain not in at
-            or given.data_type not in KINDS
-        ):
+        if given.domain not in at or given.data_type not in KINDS or name in OWN:
             continue
-        values = at[given.domain](source, column(given.data, *KINDS[given.data_type]))
+        if name.startswith(".") and name != ".uv_seam":  # selections and Blender's own tables
+            continue
+        values = at[given.domain](column(given.data, *KINDS[given.data_type]))
         made = mesh.attributes.new(name, given.data_type, given.domain)
         put(made.data, KINDS[given.data_type][0], values)
     # Names, because adding an attribute moves the others.

@@ -198,6 +198,25 @@ class Refined:
         assert self.triangle is not None
         return values[source.polygons[self.triangle[self.rows[:, 0]]]]
 
+    def of_edges(self, source: Source, old: np.ndarray, new: np.ndarray) -> np.ndarray:
+        """The original edge (of ``old``, (edges, 2) vertices) that each new one (of ``new``) is a
+        piece of; -1 for those inside of polygons."""
+        assert self.triangle is not None
+        assert self.weights is not None
+        result = np.full(len(new), -1)
+        base = max(len(source.points), len(self.points))
+        for a, b in ((0, 1), (1, 2), (2, 0)):
+            first, second = self.rows[:, a], self.rows[:, b]
+            on = (self.weights[first] == 0) & (self.weights[second] == 0)  # a side of the triangle
+            k, side = on.argmax(1), on.any(1)
+            own = source.triangles[self.triangle[first]]
+            ends = np.take_along_axis(own, np.stack([k + 1, k + 2], 1) % 3, axis=1)[side]
+            of = _found(ends, old, base)
+            at = _found(self.faces[side][:, [a, b]], new, base)
+            known = (of >= 0) & (at >= 0)
+            result[at[known]] = of[known]
+        return result
+
     def _at(self, rows: np.ndarray, corners: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Interpolate floats; whatever else has no values between gets the nearest corner's."""
         assert self.triangle is not None
@@ -210,6 +229,14 @@ class Refined:
             shape = (-1, *[1] * (values.ndim - 1))
             result += weights[:, k].reshape(shape) * values[own[:, k]]
         return result.astype(values.dtype)
+
+
+def _found(pairs: np.ndarray, edges: np.ndarray, base: int) -> np.ndarray:
+    """The index among edges (n, 2) of each pair of vertices below ``base``; -1 for none."""
+    keys, wanted = (np.sort(each.astype(np.int64), 1) @ [base, 1] for each in (edges, pairs))
+    order = np.argsort(keys)
+    place = np.searchsorted(keys[order], wanted).clip(max=len(keys) - 1)
+    return np.where(keys[order][place] == wanted, order[place], -1)
 
 
 def result(path: Path, source: Source) -> Moved | Refined:

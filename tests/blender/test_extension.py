@@ -84,6 +84,8 @@ def suzanne():
         mesh.materials.append(bpy.data.materials.new(name))
     mesh.polygons.foreach_set("material_index", np.arange(500, dtype=np.int32) % 2)
     mesh.polygons.foreach_set("use_smooth", np.arange(500) < 250)
+    for edge in mesh.edges[:100]:
+        edge.use_seam = edge.use_edge_sharp = True
     thing.modifiers.new("Subdivision", "SUBSURF").levels = 1
     upper, one = thing.vertex_groups.new(name="upper"), thing.vertex_groups.new(name="one")
     for vertex in mesh.vertices:
@@ -159,6 +161,8 @@ def test_refined_result_is_the_same_object_and_undo_brings_the_mesh_back(suzanne
     np.testing.assert_allclose(second, uv * 0.5, atol=1e-6)
     paint = column(mesh.color_attributes["paint"].data, "color_srgb", 4)
     np.testing.assert_allclose(paint, np.tile([1, 0, 0, 1], (len(paint), 1)), atol=1e-3)
+    assert 200 < sum(each.use_seam for each in mesh.edges) < 1000
+    assert [each.use_seam for each in mesh.edges] == [each.use_edge_sharp for each in mesh.edges]
     # A group's weights between its members; a key moves twice as wide.
     upper = members(thing, "upper")
     assert len(upper) > 500

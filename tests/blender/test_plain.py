@@ -227,6 +227,16 @@ def test_refined_result_knows_its_place_on_the_original(tmp_path):
     edges = np.diff(uv, axis=1)
     area = np.bincount(polygon, np.abs(np.linalg.det(edges)) / 2)
     np.testing.assert_allclose(area, 1 / 48, rtol=1e-4)
+    # Every edge is in pieces, which lie on it; the diagonals of quads are none.
+    old = np.unique(np.sort(source.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1), axis=0)
+    around = np.ptp(source.points[old, 2], axis=1) == 0  # the rings' edges
+    new = np.unique(np.sort(found.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1), axis=0)
+    pieces = found.of_edges(source, old[around], new)
+    lies = np.abs(found.points[new, 2] - np.rint(found.points[new, 2])).max(1) < 1e-3
+    lies &= np.ptp(np.rint(found.points[new, 2]), axis=1) == 0
+    low = found.points[new, 2].max(1) < 1.5  # where nothing was moved
+    np.testing.assert_array_equal((pieces >= 0)[low], lies[low])
+    assert set(pieces) == {-1, *range(around.sum())}
     # Whole numbers aren't interpolated.
     assert set(np.unique(found.of_vertices(source, np.arange(60)))) == set(range(60))
 
