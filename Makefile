@@ -6,6 +6,9 @@
 # make test-simulated   every test with the simulated GPU as its device (what fails: docs/benchmarks.md)
 # make lint   ruff and mypy
 # make docs   the documentation, to site/index.html; warnings are errors
+# make blender   pack the Blender extension: dist/styleexp-blender-VERSION.zip
+# make blender-test   its tests in Blender without a window, which is a 374 MB package in an
+#             environment of its own (.venv-bpy)
 # make conformance   write docs/conformance.md from the checks of every renderer
 # make stress   all slow tests: kill runners and workers of sweeps ten times each, with every
 #               local launcher; start two sweeps at once twenty times each way; random meshes,
@@ -43,7 +46,7 @@ export OMP_WAIT_POLICY ?= PASSIVE
 # Named meshes and images, if there are any next to the checkout.
 export STYLEEXP_ASSETS ?= $(wildcard $(abspath ../shared))
 
-.PHONY: demo test test-quick test-cuda test-simulated lint docs conformance stress stress-sweeps stress-folders stress-fuzz stress-faults \
+.PHONY: demo test test-quick test-cuda test-simulated lint docs blender blender-test conformance stress stress-sweeps stress-folders stress-fuzz stress-faults \
 	stress-long matrix sbom audit bench-guard ray-test clean
 .DELETE_ON_ERROR:
 
@@ -71,6 +74,20 @@ lint: $(VENV)/.installed-dev
 docs: $(VENV)/.installed-dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo site/index.html
+
+blender:
+	$(PYTHON) blender/build.py
+
+# bpy is GPL, and for Python 3.11 alone: never beside the package.
+blender-test: $(VENV)/.installed $(VENV)-bpy/.installed
+	STYLEEXP_COMMAND=$(abspath $(BIN)/styleexp) OMP_NUM_THREADS=1 \
+		$(VENV)-bpy/bin/python -m pytest --noconftest tests/blender/test_extension.py
+
+$(VENV)-bpy/.installed: Makefile
+	test -x $(VENV)-bpy/bin/python || python3.11 -m venv $(VENV)-bpy
+	$(VENV)-bpy/bin/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) \
+		'bpy==5.0.1' 'pytest>=8'
+	@touch $@
 
 conformance: $(VENV)/.installed-dev
 	$(BIN)/python -m styleexp.testing > docs/conformance.md
@@ -130,7 +147,7 @@ ray-test: pyproject.toml constraints.txt
 	OMP_NUM_THREADS=1 $(VENV)-ray/bin/python -m pytest tests/experiments/test_ray.py
 
 clean:
-	rm -rf $(VENV) $(VENV)-ray $(VENV)-security $(VENV)-nox .nox build dist src/*.egg-info
+	rm -rf $(VENV) $(VENV)-ray $(VENV)-security $(VENV)-nox $(VENV)-bpy .nox build dist src/*.egg-info
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

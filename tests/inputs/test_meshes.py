@@ -6,6 +6,7 @@ import contextlib
 import io
 import json
 import os
+import re
 import struct
 import subprocess
 import sys
@@ -359,6 +360,68 @@ def test_hard_edges_of_glb_survive_and_seams_stay_smooth(tmp_path):
         assert len(carrier.rows) == mesh.faces.size
         key = np.column_stack([carrier.rows, carrier.normals.round(4)])
         assert len(np.unique(key, axis=0)) == rows
+
+
+def corner_normals(path):
+    """What another reader finds: a normal for each corner of an OBJ or PLY file, (faces, 3, 3)."""
+    if path.suffix == ".ply":
+        read = trimesh.load(path, process=False)
+        return read.vertex_normals[read.faces]
+    lines = [line.split() for line in path.read_text().splitlines()]
+    normals = np.array([line[1:] for line in lines if line[0] == "vn"], float)
+    words = [[word.split("/") for word in line[1:]] for line in lines if line[0] == "f"]
+    return normals[np.array(words)[..., 2].astype(int) - 1]
+
+
+@pytest.mark.parametrize("kind", ["obj", "ply"])
+@pytest.mark.parametrize("seam", [False, True])
+def test_files_without_hard_edges_get_smooth_normals(tmp_path, kind, seam):
+    ball = trimesh.creation.uv_sphere()
+    lines = [f"v {x} {y} {z}" for x, y, z in ball.vertices]
+    lines += [f"vt {x} {y}" for x, y, _ in ball.vertices] + ["vt 9 9"] if seam else []
+    corner = "{0}/{0}" if seam else "{0}"
+    lines += ["f " + " ".join(map(corner.format, face)) for face in (ball.faces + 1).tolist()]
+    if seam:  # the last face's corners have texture coordinates of their own
+        lines[-1] = re.sub(r"/\d+", f"/{len(ball.vertices) + 1}", lines[-1])
+    (tmp_path / "ball.obj").write_text("\n".join(lines) + "\n")
+    mesh, path = meshes.load_mesh(tmp_path / "ball.obj"), tmp_path / f"out.{kind}"
+    stretched = mesh.vertices * [1, 1, 3]
+    meshes.save_mesh(mesh, stretched, path)
+    back = trimesh.load(path, process=False)
+    assert len(back.faces) == len(mesh.faces)
+    assert len(meshes.load_mesh(path).vertices) == len(mesh.vertices)
+    own = meshes.vertex_normals(stretched, mesh.faces)[mesh.faces]
+    np.testing.assert_allclose(corner_normals(path), own, atol=1e-4)
+    # And what they are to be: the stretched sphere's.
+    exact = mesh.vertices / [1, 1, 3]
+    exact /= np.linalg.norm(exact, axis=1, keepdims=True)
+    assert (corner_normals(path) * exact[mesh.faces]).sum(-1).min() > 0.98
+
+
+def test_hard_edges_stay_hard_in_obj_and_ply(tmp_path):
+    box = trimesh.creation.box()
+    box.unmerge_vertices()
+    box.vertex_normals = flat = np.repeat(box.face_normals, 3, axis=0)
+    trimesh.Scene(box).export(tmp_path / "box.glb", include_normals=True)
+    box.export(tmp_path / "box.ply", vertex_normal=True)
+    for name in ("box.glb", "box.ply"):
+        mesh = meshes.load_mesh(tmp_path / name)
+        meshes.save_mesh(mesh, mesh.vertices * 2, tmp_path / "out.obj")
+        np.testing.assert_allclose(corner_normals(tmp_path / "out.obj"), flat.reshape(-1, 3, 3))
+        meshes.save_mesh(mesh, mesh.vertices * 2, tmp_path / "out.ply")
+        if name == "box.ply":
+            np.testing.assert_allclose(corner_normals(tmp_path / "out.ply"), flat.reshape(-1, 3, 3))
+        else:  # the rows of a glTF's faces are joined, and have no room for them
+            assert b"property float nx" not in (tmp_path / "out.ply").read_bytes()
+    # Smoothing groups are the file's own way of saying it.
+    lines = [f"v {x} {y} {z}" for x, y, z in box.vertices.tolist()]
+    lines += [f"s {k}\nf {3 * k + 1} {3 * k + 2} {3 * k + 3}" for k in range(len(box.faces))]
+    (tmp_path / "box.obj").write_text("\n".join(lines) + "\n")
+    mesh = meshes.load_mesh(tmp_path / "box.obj")
+    meshes.save_mesh(mesh, mesh.vertices * 2, tmp_path / "out.obj")
+    words = (tmp_path / "out.obj").read_text().split()
+    assert "vn" not in words
+    assert words.count("s") == 12
 
 
 # --------------------------------------------------------------------------------------------- glTF

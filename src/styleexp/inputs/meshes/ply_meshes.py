@@ -168,7 +168,7 @@ def ply_of(
     them.
 
     Everything else from the source PLY is preserved, in its types. Without a source PLY, positions
-    are floats. ``displacement`` (rows,) is written as a float property.
+    are floats. ``normals`` (rows, 3) and ``displacement`` (rows,) are written as float properties.
     """
     vertex: dict[str, Column] = {name: np.zeros(0, np.float32) for name in POSITION}
     face: dict[str, Column] = {}
@@ -179,9 +179,10 @@ def ply_of(
         face, comments = dict(carrier.ply.face), list(carrier.ply.comments)
     for k, name in enumerate(POSITION):
         vertex[name] = points[:, k].astype(_float(vertex[name]))
-    if normals is not None and set(NORMAL) <= vertex.keys():
+    if normals is not None:
         for k, name in enumerate(NORMAL):
-            vertex[name] = normals[:, k].astype(_float(vertex[name]))
+            kind = _float(vertex.get(name, np.zeros(0, np.float32)))
+            vertex[name] = normals[:, k].astype(kind)
     if carrier.colors is not None and not set(COLOR) <= vertex.keys():
         for k, name in enumerate((*COLOR, "alpha")):
             vertex[name] = carrier.colors[first, k]

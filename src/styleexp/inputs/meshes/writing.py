@@ -39,13 +39,15 @@ def save_mesh(
     ``path``'s extension.
 
     ``vertices`` replace `Mesh.vertices`, in the same frame. The input file's rows are preserved:
-    texture coordinates with their seams, materials and images, colours, part names, winding. A GLB
-    gets recomputed normals, with the hard edges of a glTF input.
+    texture coordinates with their seams, materials and images, colours, part names, winding.
+    Normals are recomputed, smooth but for the hard edges of a glTF or PLY input's own.
 
     - PLY: one object without textures; ``displacement`` is a float vertex property. A PLY input's
-      own properties are preserved, in their types.
+      own properties are preserved, in their types. No normals where the file's rows can't have the
+      hard edges of a glTF input.
     - OBJ: faces and materials in the file's order. Materials and images are written next to it,
-      named after it: ``out.obj``, ``out.mtl``, ``out_wood.png``.
+      named after it: ``out.obj``, ``out.mtl``, ``out_wood.png``. No normals where the input has
+      smoothing groups, which are preserved.
     - GLB: a glTF input's own document, with new positions and normals (if it has normals) and
       without tangents; otherwise one node per part. ``displacement`` is the custom attribute
       ``_DISPLACEMENT``, in the mesh's own units regardless of node scales.
@@ -117,14 +119,21 @@ def glb_as_it_is(mesh: Mesh, normals: Float[np.ndarray, "rows 3"]) -> bytes:
     return new_glb(carrier, list(_runs(carrier)), points, normals, None)
 
 
-def _row_normals(carrier: Carrier, vertices: np.ndarray) -> np.ndarray:
-    """Unit normals (rows, 3), smooth across corners that the file's normals mark as smooth."""
+def _normals(carrier: Carrier, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit normals (normals, 3), smooth across corners that the file's normals mark as smooth, and
+    the index of each row's."""
     groups = carrier.rows
     if carrier.normals is not None:
         rounded = np.round(np.nan_to_num(carrier.normals) * 50)
         groups = _distinct(carrier.rows, rounded)[1]
     faces = carrier.rows[carrier.corners]
-    return vertex_normals(vertices, faces, groups[carrier.corners])[groups]
+    return vertex_normals(vertices, faces, groups[carrier.corners]), groups
+
+
+def _row_normals(carrier: Carrier, vertices: np.ndarray) -> np.ndarray:
+    """Unit normals (rows, 3)."""
+    normals, index = _normals(carrier, vertices)
+    return normals[index]
 
 
 def _distinct(*columns: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
@@ -157,7 +166,10 @@ def _ply(
 ) -> bytes:
     first, combined = ply_rows(carrier)
     rows = carrier.rows[first]
-    points, normals = vertices[rows], None
+    points, of_rows = vertices[rows], _row_normals(carrier, vertices)
+    normals: np.ndarray | None = of_rows[first]
+    if not np.array_equal(of_rows, of_rows[first][combined]):
+        normals = None  # hard edges would become smooth
     if carrier.ply is not None:
         moved = (vertices != mesh.vertices).any(axis=1)
         own = np.stack([carrier.ply.vertex[name] for name in "xyz"], axis=1)[first]
@@ -166,8 +178,7 @@ def _ply(
         if carrier.normals is not None:
             near = np.zeros(len(vertices), dtype=bool)
             near[mesh.faces[moved[mesh.faces].any(axis=1)]] = True
-            new = _row_normals(carrier, vertices)[first]
-            normals = np.where(near[rows][:, None], new, carrier.normals[first])
+            normals = np.where(near[rows][:, None], of_rows[first], carrier.normals[first])
     values = None if displacement is None else np.asarray(displacement)[rows]
     return ply_of(carrier, first, combined[carrier.corners], points, normals, values)
 
@@ -251,6 +262,11 @@ def _obj(carrier: Carrier, mesh: Mesh, vertices: np.ndarray, path: Path) -> dict
     if carrier.uv is not None:
         first, index = _distinct(carrier.uv)
         out += [_line("vt", row, 17) for row in carrier.uv[first].tolist()]
+        words.append(index + 1)
+    if "s" not in carrier.labels:
+        normals, index = _normals(carrier, vertices)
+        out += [_line("vn", row, 4) for row in (normals.round(4) + 0.0).tolist()]  # no -0
+        words += [np.full(len(index), "")] if carrier.uv is None else []
         words.append(index + 1)
     corner = ["/".join(map(str, row)) for row in np.stack(words, axis=1).tolist()]
 
