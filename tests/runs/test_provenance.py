@@ -13,6 +13,7 @@ import pytest
 from styleexp.experiments import reproduce
 from styleexp.plugins import code
 from styleexp.runs import identity, provenance, reading
+from styleexp.system import locks
 from styleexp.system.errors import UserError
 from tests.helpers import ROOT, warm
 
@@ -147,11 +148,22 @@ def test_a_run_is_made_again_and_left_as_it_is(swept, tmp_path):
     before = {path: path.read_bytes() for path in (swept / "all/1").rglob("*") if path.is_file()}
     done = styleexp("reproduce", "all/1", "--out", tmp_path / "again", cwd=swept)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "nothing differs from then" in done.stdout
+    assert "made with what it was made with then" in done.stdout
     assert "vertices: the same bits" in done.stdout
     assert done.stdout.rstrip().endswith("reproduced: all is equal")
     assert {path: path.read_bytes() for path in before} == before
     assert record(tmp_path / "again")["command"] == ["styleexp", "reproduce", "all/1"]
+
+
+def test_a_run_that_still_goes_is_not_made_again(swept, tmp_path):
+    shutil.copytree(swept / "all/0", tmp_path / "goes")
+    (tmp_path / "goes/status.json").write_text('{"schema": 1, "status": "running"}')
+    with (
+        locks.hold(tmp_path / "goes"),
+        pytest.raises(UserError, match="still running; wait until it is done"),
+    ):
+        reproduce.reproduce(tmp_path / "goes", tmp_path / "again")
+    assert not (tmp_path / "again").exists()
 
 
 def test_what_differs_is_told_one_by_one(swept, tmp_path, capsys, coarse_shapes):

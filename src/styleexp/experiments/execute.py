@@ -134,7 +134,7 @@ def _guarded(
     look = live.Live(folder, config.report)
     try:
         if not replaces:
-            _begin(folder, None if resumed else record, look)
+            folder.begin(None if resumed else record)
         with announced():
             return _execute(config, folder, record, resumed, look)
     except BrokenPipeError:  # as with `styleexp ... | head`; not the folder's fault
@@ -160,14 +160,6 @@ def _guarded(
         look.end()
 
 
-def _begin(folder: records.RunFolder, record: dict[str, Any] | None, look: live.Live) -> None:
-    """Mark the folder as running, and say where to watch."""
-    folder.begin(record)
-    if look.wanted:
-        print("watch it on this page, which reloads itself:", flush=True)
-        progress.print_paths([look.path])
-
-
 def _resuming(folder: records.RunFolder) -> str:
     """The command that continues the run."""
     return shlex.join(["styleexp", f"resume={folder.path.absolute()}"])
@@ -191,7 +183,7 @@ def _execute(
     _check(config)
     method, scene = build.prepare(config)
     if not folder.begun:
-        _begin(folder, record, look)
+        folder.begin(record)
     doing("")
     look.prepared(scene.subject)
     for note in (*scene.subject.notes, *scene.notes):

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
+from styleexp.experiments.progress import print_paths
 from styleexp.runs import reading
 from styleexp.system import atomic, progress
 
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     from styleexp.runs.reading import Run
     from styleexp.runs.records import RunFolder
 
+FIRST = 1.5
+"""Seconds until there is a page, and the terminal names it: most mistakes are found sooner."""
 EVERY = 2.0
 """Seconds between two writings, in a run's first minutes."""
 PACE = 0.01
@@ -127,12 +130,16 @@ class Live:
         self._pictures[kind] = [html.data_uri(Image.fromarray(each), PIXELS) for each in drawn]
 
     def _keep_writing(self) -> None:
-        wait = 0.5
+        wait, told = FIRST, False
         while not self._ended.wait(wait):
             wait = max(EVERY, PACE * (time.monotonic() - self._begun))
             if self._folder.begun:
                 with suppress(OSError):  # the run itself meets and tells it
                     self._write(wait)
+                    if not told:
+                        print("watch it on this page, which reloads itself:", flush=True)
+                        print_paths([self.path])
+                        told = True
 
     def _write(self, wait: float) -> None:
         from styleexp.experiments.reports import charts, html

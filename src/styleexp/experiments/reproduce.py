@@ -50,6 +50,8 @@ def reproduce(folder: Path, out: Path | None = None) -> int:
     was, and if ``out`` is in use.
     """
     run = reading.recorded(folder, "reproduce")
+    if run.status == "running":
+        raise UserError(f"cannot reproduce '{folder}': it is still running; wait until it is done.")
     if not (folder / results.NAME).is_file():
         raise UserError(
             f"cannot reproduce '{folder}': it has no {results.NAME} to compare with; a stopped run "
@@ -64,7 +66,8 @@ def reproduce(folder: Path, out: Path | None = None) -> int:
     as_recorded(config, run.record)
     tell_differences(run, _here(config, run))
     here = folder.absolute()
-    new = out or claim.fresh(HOME / here.parent.name / here.name)
+    pair = "" if here.parent.name == HOME.parent.name else here.parent.name
+    new = out or claim.fresh(HOME / pair / here.name)
     command = ["styleexp", "reproduce", str(folder)]
     with measured.anew():
         code = execute.run(config, new, run.overrides, command=command)
@@ -112,7 +115,7 @@ def tell_differences(run: Run, here: Mapping[str, Any]) -> None:
     else:
         names = ("styleexp", "commit", "torch", "device", "threads")
         shown = ", ".join(f"{name} {known[name]}" for name in names if name in known)
-        print(f"nothing differs from then, of what is recorded: {shown}")
+        print(f"made with what it was made with then: {shown}")
     if unknown := [name for name in now if name not in known]:
         print(f"not recorded then: {', '.join(unknown)}")
 

@@ -352,6 +352,7 @@ def _download_url(asset: Asset, url: str, scratch: Path) -> Path:
             raise ValueError(f"sha256 {found}, expected {asset.sha256}...")
 
     log.warning("downloading the %s from %s; this happens only once.", _called(asset), url)
+    pooch.get_logger().setLevel(logging.ERROR)  # its own talk of each try
     shop = pooch.create(
         path=scratch,
         base_url="",
