@@ -66,8 +66,9 @@ def _parser() -> argparse.ArgumentParser:
                         "the other in each of the launcher's processes, which start "
                         "once")  # fmt: skip
     parser.add_argument("--retry", action="store_true", help="run failed jobs again")
-    parser.add_argument("--check", action="store_true", help="fetch what is missing, say what can't be, how the jobs "
-                        "would be started and what they cost; run nothing")  # fmt: skip
+    parser.add_argument("--check", action="store_true", help="fetch what is missing and say "
+                        "what can't be fetched, how the jobs would be started and what they cost; "
+                        "run nothing")  # fmt: skip
     parser.add_argument("--no-check", action="store_true", help="start although something is "
                         "missing: the jobs that need it fail")  # fmt: skip
     parser.add_argument("--dry-run", action="store_true", help="print the commands, run nothing")
