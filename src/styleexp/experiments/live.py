@@ -34,7 +34,7 @@ EVERY = 2.0
 PACE = 0.01
 """And later: this share of the time that the run has taken."""
 SHARE = 0.02
-"""Largest share of a run's time for drawing."""
+"""Largest share of the time for drawing between steps."""
 SEVERAL = 4.0
 """Least seconds between two pictures."""
 HEARTBEAT = 60.0
