@@ -11,7 +11,6 @@ import trimesh
 from PIL import Image
 
 import styleexp
-from styleexp.cli.studio.kept import Remembering
 from styleexp.cli.studio.settings import Settings, safe_name
 from styleexp.cli.studio.workbench import Workbench
 from styleexp.inputs import meshes, shapes
@@ -82,10 +81,10 @@ def test_height_and_place_need_no_synthesis_and_direction_no_sampling(bench, mon
     )
     bench.change({"strength": 0.3, "mask": "slope:60"})
     until(bench, lambda s: done(s) and s["settings"]["strength"] == 0.3)
-    assert not any(stage and "round" in stage for stage in stages)
+    assert not any(stage and "synthesising" in stage for stage in stages)
     bench.change({"rotation": 45.0})
     until(bench, lambda s: done(s) and s["settings"]["rotation"] == 45.0)
-    assert any(stage and "round" in stage for stage in stages)
+    assert any(stage and "synthesising" in stage for stage in stages)
 
 
 def test_learning_goes_on_from_the_synthesis_until_it_is_stopped(files, tmp_path, monkeypatch):
@@ -113,24 +112,6 @@ def test_learning_goes_on_from_the_synthesis_until_it_is_stopped(files, tmp_path
     bench.change({"strength": 0.5})
     state = until(bench, lambda state: done(state) and state["learned"] == 0)
     assert "method=robust" not in state["command"]
-
-
-def test_kept_samples_are_those_of_the_exemplar():
-    class Exemplar:
-        calls = 0
-
-        def sample(self, count, side, spacing, rng, any_way):
-            self.calls += 1
-            return rng.random(count)
-
-    given = Exemplar()
-    kept = Remembering(given)
-    first, again = np.random.default_rng(0), np.random.default_rng(0)
-    assert np.array_equal(kept.sample(3, 1, 1.0, first, True), kept.sample(3, 1, 1.0, again, True))
-    assert given.calls == 1
-    assert first.random() == again.random()
-    kept.sample(3, 1, 2.0, np.random.default_rng(0), True)
-    assert given.calls == 2
 
 
 def test_a_wrong_mask_is_said_and_the_next_settings_work(bench):

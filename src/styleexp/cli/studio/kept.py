@@ -7,8 +7,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from styleexp.api import configured
 from styleexp.config import build, sources
 from styleexp.config.checks import check
@@ -23,7 +21,6 @@ if TYPE_CHECKING:
 
     from styleexp.cli.studio.settings import Settings
     from styleexp.method.subject import Subject
-    from styleexp.method.synthesis.exemplar import Exemplar, Places
 
 
 class Kept:
@@ -83,15 +80,9 @@ class Kept:
         return replace(subject, settings=wanted, mask=mask, notes=notes)
 
     def begun(self, settings: Settings, more: tuple[str, ...], subject: Subject) -> synthesis.Begun:
-        """The pattern and the source to walk on. Patches of the style that were sampled before with
-        the same random numbers are kept."""
+        """The pattern and the source to walk on."""
         key = (settings.source, settings.style, settings.scale, settings.invert, settings.seed)
-
-        def make() -> synthesis.Begun:
-            begun = synthesis.begin(subject)
-            return replace(begun, exemplar=Remembering(begun.exemplar))
-
-        found: synthesis.Begun = self._get(f"begun {more}", key, make)
+        found: synthesis.Begun = self._get(f"begun {more}", key, lambda: synthesis.begin(subject))
         return found
 
     def _heights_key(self, settings: Settings) -> Any:
@@ -105,31 +96,3 @@ class Kept:
     def keep_heights(self, settings: Settings, more: tuple[str, ...], height: Tensor) -> None:
         """Keep them for the next settings."""
         self._kept[f"heights {more}"] = (self._heights_key(settings), height)
-
-
-class Remembering:
-    """An exemplar that keeps its samples, which another direction needs again: the same arguments
-    and random numbers give the same patches, and leave the generator in the same state."""
-
-    MOST = 6
-
-    def __init__(self, exemplar: Exemplar):
-        self._exemplar = exemplar
-        self._kept: dict[str, Any] = {}
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._exemplar, name)
-
-    def sample(
-        self, count: int, side: int, spacing: float, rng: np.random.Generator, any_way: bool
-    ) -> tuple[Tensor, Places]:
-        """See `Exemplar.sample`."""
-        key = repr((count, side, spacing, any_way, rng.bit_generator.state))
-        if key not in self._kept:
-            found = self._exemplar.sample(count, side, spacing, rng, any_way)
-            while len(self._kept) >= self.MOST:
-                del self._kept[next(iter(self._kept))]
-            self._kept[key] = (found, rng.bit_generator.state)
-        found, after = self._kept[key]
-        rng.bit_generator.state = after
-        return found

@@ -279,14 +279,14 @@ class Workbench:
             height, last = self._kept.heights_for(settings, more), 0.0
             if height is None:
                 rounds = synthesis.heights(subject, begun, method.config)
-                for number, height in enumerate(rounds, 1):
+                for height in rounds:
                     self._check(serial)
                     if time.monotonic() - last > OFTEN:
                         result = method.laid(subject, begun, height)
                         self._show(serial, result, settings, False)
                         last = time.monotonic()
                     with self._lock:
-                        self._tell(f"synthesising {name}, round {number}")
+                        self._tell(f"synthesising {name}")
                 assert height is not None
                 self._kept.keep_heights(settings, more, height)
             self._check(serial)

@@ -6,7 +6,7 @@ for an image.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Protocol, TypeAlias
 
@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch.nn import functional
 
+from styleexp.inputs import measured
 from styleexp.method.patches import blurred
 from styleexp.method.relief import mesh_frequency, smoother
 from styleexp.method.synthesis.direction import UP, direction_field, turned
@@ -216,6 +217,31 @@ class PictureExemplar:
         return places[:, :2] * self.pixel
 
 
+def sampled(
+    exemplar: Exemplar,
+    count: int,
+    side: int,
+    spacing: float,
+    seed: tuple[int, ...],
+    any_way: bool,
+) -> tuple[Float[Tensor, "patches side side"], Places]:
+    """`Exemplar.sample` with the random numbers of a seed. A mesh's patches, which take a walk over
+    it, are kept for the next run with the same style, on whatever source."""
+
+    def make() -> tuple[Tensor, Places]:
+        return exemplar.sample(count, side, spacing, np.random.default_rng(seed), any_way)
+
+    if isinstance(exemplar, PictureExemplar):
+        return make()
+    about = f"{count} {side} {spacing!r} {seed} {any_way}"
+    found = measured.kept("patches", exemplar.arrays(), about, lambda: _named(*make()))
+    return torch.from_numpy(found["patches"]), found["places"]
+
+
+def _named(patches: Tensor, places: Places) -> measured.Arrays:
+    return {"patches": patches.numpy(), "places": places}
+
+
 @dataclass(frozen=True)
 class Pattern:
     """Measurements of an exemplar's patches."""
@@ -228,6 +254,17 @@ class Pattern:
     low: float
     high: float
     """``low`` and ``high`` are the 1st and 99th percentiles of the heights."""
+
+
+def pattern_of(exemplar: Exemplar, seed: int) -> Pattern:
+    """`measure` with the random numbers of a seed; kept for the next run with the same style."""
+
+    def make() -> measured.Arrays:
+        found = measure(exemplar, np.random.default_rng(seed))
+        return {name: np.array([each]) for name, each in asdict(found).items()}
+
+    found = measured.kept("pattern", exemplar.arrays(), str(seed), make)
+    return Pattern(**{name: each.item() for name, each in found.items()})
 
 
 def measure(exemplar: Exemplar, rng: np.random.Generator) -> Pattern:

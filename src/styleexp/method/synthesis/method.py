@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections import deque
 from collections.abc import Iterator
@@ -21,7 +20,7 @@ from styleexp.method.masks import masked
 from styleexp.method.relief import half_range, mesh_relief, smoother
 from styleexp.method.surface import unfolded
 from styleexp.method.synthesis.direction import FLOW, UP, direction_field, turned
-from styleexp.method.synthesis.exemplar import MeshExemplar, Pattern, PictureExemplar, measure
+from styleexp.method.synthesis.exemplar import MeshExemplar, Pattern, PictureExemplar, pattern_of
 from styleexp.method.synthesis.optimise import Level, synthesise
 from styleexp.method.synthesis.room import ball_radius
 from styleexp.method.synthesis.walk import Sheet
@@ -85,8 +84,6 @@ class Begun:
     exemplar: Exemplar
     pattern: Pattern
     sheet: Sheet
-    rng: np.random.Generator
-    """Copied before each use, so that every synthesis draws the same numbers."""
 
     @property
     def directed(self) -> bool:
@@ -106,33 +103,32 @@ def relief(
 
 def begin(subject: Subject) -> Begun:
     """Measure the style's pattern, and prepare the source for walking."""
-    rng = np.random.default_rng(subject.settings.optim.seed)
     doing("measuring the style's pattern")
     exemplar = exemplar_of_style(subject)
-    pattern = measure(exemplar, rng)
+    pattern = pattern_of(exemplar, subject.settings.optim.seed)
     surface = subject.surface
     sheet = Sheet(
         surface.vertices.cpu().numpy(), subject.source.faces, surface.normals.cpu().numpy()
     )
-    return Begun(exemplar, pattern, sheet, rng)
+    return Begun(exemplar, pattern, sheet)
 
 
 def heights(
     subject: Subject, begun: Begun, config: SynthesisConfig
 ) -> Iterator[Float[Tensor, " vertices"]]:
     """Synthesise the pattern on the source: the vertices' heights, in units of the pattern, after
-    every round. The last are the result."""
-    rng = copy.deepcopy(begun.rng)
+    the quilt and every round. The last are the result."""
     ahead = directions(subject, begun.sheet, begun.directed)
     levels = levels_of(begun.pattern, begun.sheet.edge / subject.unit)
     tell(summary(subject, begun.pattern, begun.directed, levels))
     total = sum(level.rounds for level in levels)
     found = synthesise(
-        begun.sheet, ahead, begun.exemplar, levels, subject.unit, not begun.directed, rng,
-        most=config.bank,
+        begun.sheet, ahead, begun.exemplar, levels, subject.unit, not begun.directed,
+        subject.settings.optim.seed, most=config.bank,
     )  # fmt: skip
     for number, height in found:
-        doing(f"synthesising the relief, round {number} of {total}")
+        if number:
+            doing(f"synthesising the relief, round {number} of {total}")
         yield height
 
 

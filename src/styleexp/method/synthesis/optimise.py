@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from styleexp.method.synthesis.exemplar import sampled
 from styleexp.method.synthesis.quilting import quilt
 from styleexp.method.synthesis.walk import Sheet
 from styleexp.system.progress import doing
@@ -140,11 +141,11 @@ def synthesise(
     levels: list[Level],
     unit: float,
     any_way: bool,
-    rng: np.random.Generator,
+    seed: int,
     most: int = 10_000,
 ) -> Iterator[tuple[int, Float[Tensor, " vertices"]]]:
-    """Yield the vertices' heights, in units of the pattern, after every round, with its 1-based
-    number.
+    """Yield the vertices' heights, in units of the pattern, after every round, with its number;
+    that of the quilt, from which the first round starts, is 0.
 
     ``ahead`` is the direction of the pattern's up, ``unit`` the length of a pattern unit on the
     mesh, ``most`` the maximum size of a level's bank.
@@ -152,14 +153,17 @@ def synthesise(
     doing("covering the source with pieces of the style")
     first, last = levels[0], levels[-1]
     choice = round(CHOICE * most)
-    laid = quilt(sheet, ahead, exemplar, first.spacing, last.spacing, unit, any_way, rng, choice)
+    laid = quilt(sheet, ahead, exemplar, first.spacing, last.spacing, unit, any_way, seed, choice)
     height = laid.heights()
     done = 0
-    for level in levels:
+    yield done, height
+    rng = np.random.default_rng(seed)
+    for number, level in enumerate(levels, 1):
         fine = level is last and level is not first
         side, density = (FINE_SIDE, FINE_DENSITY) if fine else (SIDE, DENSITY)
         weight = _gaussian(side, VOTE)
-        known = bank(exemplar.sample(most, side, level.spacing, rng, any_way)[0])
+        doing("taking patches of the style")
+        known = bank(sampled(exemplar, most, side, level.spacing, (seed, number), any_way)[0])
         middle = sheet.spread(density * level.spacing * unit, rng)
         sample = sheet.sampling(middle, ahead[middle], side, level.spacing * unit)
         spread = sample.T
@@ -184,7 +188,7 @@ def synthesise(
             yield done, height
     # Averaging votes reduces the depth. (Matching the exemplar's unblurred distribution would
     # broaden its ridges, because a mesh can't represent slopes that steep.)
-    own_heights = exemplar.sample(SAMPLES, 1, 1e-6, rng, any_way)[0]
+    own_heights = sampled(exemplar, SAMPLES, 1, 1e-6, (seed,), any_way)[0]
     gain = float(own_heights.std() / height.std().clamp(min=1e-12))
     yield done, height.mean() + min(gain, MOST_GAIN) * (height - height.mean())
 

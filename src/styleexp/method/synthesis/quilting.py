@@ -11,6 +11,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from styleexp.method.patches import blurred
+from styleexp.method.synthesis.exemplar import sampled
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -74,7 +75,7 @@ def quilt(
     finest: float,
     unit: float,
     any_way: bool,
-    rng: np.random.Generator,
+    seed: int,
     choice: int,
 ) -> Quilt:
     """Cover the mesh with pieces of the exemplar, each chosen to match those already placed (after
@@ -84,7 +85,8 @@ def quilt(
     the offset of rows. ``spacing`` is the sample spacing for comparing pieces, ``finest`` that of
     the stored pieces. ``choice`` pieces are tried at each position.
     """
-    known, places = exemplar.sample(choice, SIDE, spacing, rng, any_way)
+    known, places = sampled(exemplar, choice, SIDE, spacing, (seed,), any_way)
+    rng = np.random.default_rng(seed)
     pieces = known.flatten(1).numpy()
     squares = pieces**2
     step = spacing * unit
@@ -92,18 +94,18 @@ def quilt(
     height, filled = np.zeros(count, np.float32), np.zeros(count, np.float32)
     piece = np.full((count, LABELS), -1)
     place, turn = np.zeros((count, LABELS, 2)), np.zeros((count, LABELS, 2))
-    for seed, grid in _grids(sheet, ahead, step, piece, rng):
+    for start, grid in _grids(sheet, ahead, step, piece):
         points, nears, carried = grid
         sample = sheet.interpolation(points, nears)
-        seen = (sample @ filled > 0.99) & (sheet.normals[nears] @ sheet.normals[seed] > SAME_WAY)
+        seen = (sample @ filled > 0.99) & (sheet.normals[nears] @ sheet.normals[start] > SAME_WAY)
         if seen.any():
             here = seen.astype(np.float32)
             best = int((squares @ here - 2 * pieces @ (here * (sample @ height))).argmin())
         else:
             best = int(rng.integers(len(pieces)))
         reach = 0.75 * SIDE * step
-        around = np.asarray(sheet.tree.query_ball_point(sheet.vertices[seed], reach))
-        facing = sheet.normals[around] @ sheet.normals[seed] > SAME_WAY
+        around = np.asarray(sheet.tree.query_ball_point(sheet.vertices[start], reach))
+        facing = sheet.normals[around] @ sheet.normals[start] > SAME_WAY
         around = around[facing & (piece[around, -1] < 0)]
         away, cell = cKDTree(points).query(sheet.vertices[around], distance_upper_bound=step)
         on = np.isfinite(away)
@@ -143,7 +145,6 @@ def _grids(
     ahead: Float[np.ndarray, "vertices 3"],
     step: float,
     piece: Int[np.ndarray, "vertices labels"],
-    rng: np.random.Generator,
 ) -> Iterator[tuple[int, tuple[np.ndarray, np.ndarray, np.ndarray]]]:
     """Positions of pieces and their grid points: everywhere, then where ``piece`` has gaps, such as
     behind the bends of a limb."""

@@ -153,7 +153,7 @@
     const { settings } = state, busy = !["done", "failed"].includes(state.stage);
     root.classList.toggle("busy", busy);
     byId("stage-line").textContent = state.stage === "done" ? (state.finished ? "Done" : "Stopped")
-      : state.stage + (/^preparing/.test(state.stage) && state.detail ? `: ${state.detail}` : "");
+      : state.stage + (/^(preparing|synthesising)/.test(state.stage) && state.detail ? `: ${state.detail}` : "");
     byId("size-line").textContent = state.result ? `${state.result.vertices.toLocaleString()} vertices` +
       (state.learned ? `, ${state.learned} steps learned` : "") : "";
     if (state.error) complain(state.error);
