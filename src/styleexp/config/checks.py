@@ -27,6 +27,10 @@ def check(config: Config) -> None:
             f"source.refine={refine} is not allowed: give auto, none or a number of faces from 100 "
             "to 9999999."
         )
+    if config.simplify is not None:
+        from styleexp.inputs.meshes import simplifying
+
+        simplifying.check()
     background = config.shading.background
     if background not in ("white", "black", "foreground"):
         try:

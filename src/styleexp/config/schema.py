@@ -66,6 +66,9 @@ class Config(Settings):
     formats: list[str] = option(factory=list, choices=("stl", "3mf"))
     """Formats in which the result is written besides PLY, OBJ and GLB: ``formats=[stl,3mf]``, for
     printing."""
+    simplify: int | None = option(None, between=(100, 4_000_000))
+    """Also write the result with about this many faces, as ``result_simplified``: more if fewer
+    would lose more than 5 % of the relief. Needs the extra ``simplify``."""
     keep_checkpoint: bool = True
     """Keep the last checkpoints of a finished run, from which it could go on. ``false`` removes
     them once it is done; an unfinished run has them in any case."""

@@ -347,21 +347,14 @@ def _write_results(
     """Write, draw and measure the result; return the files to name to the user, and the metrics."""
     from styleexp import plugins
     from styleexp.experiments.ratings import verdict
-    from styleexp.runs import previews, prints
+    from styleexp.runs import exports, previews
 
-    also = [f"result.{kind}" for kind in config.formats]
-    for name in ("result.ply", "result.obj", "result.glb", *also):
-        doing(f"writing {name}")
-        result.save(folder.path / name)
-    if also:
-        doing("looking at the result as a printer would")
-        for note in prints.notes(result.vertices, result.faces):
-            print(f"note: {note}")
+    meshes = exports.write(result, config, folder.path)
     doing("drawing the preview and the turntable")
     size, frames = config.preview.resolution, config.preview.turntable_frames
     folder.write("preview.png", lambda path: previews.write_preview(result, size, path))
     folder.write("turntable.gif", lambda path: previews.write_turntable(result, frames, size, path))
-    names = ("preview.png", "turntable.gif", "result.glb", "result.ply", "result.obj", *also)
+    names = ("preview.png", "turntable.gif", *meshes)
     written = [folder.path / name for name in names]
     doing("measuring the result")
     measured = _measure(result, config)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 ABSENT = "not found"
 """Placeholder for the sha256 of a missing file."""
-ASIDE = ("threads", "debug", "logger", "report", "formats", "keep_checkpoint")
+ASIDE = ("threads", "debug", "logger", "report", "formats", "simplify", "keep_checkpoint")
 """Keys that don't affect a result."""
 
 
