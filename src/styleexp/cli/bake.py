@@ -27,8 +27,6 @@ FORMATS = ("png", "exr")
 SIZES = (16, 16384)
 MOST_ONTO = 8192
 """Largest side of maps of another mesh, which take 5 GB of memory."""
-LOST = 1e-3
-"""Fraction of texels without a value of their own that is worth a note."""
 SOURCE = "source"
 """Value of ``--onto`` for the run's own source."""
 
@@ -70,7 +68,8 @@ def bake(options: argparse.Namespace) -> list[Path]:
             onto = SOURCE
     if onto is not None:
         source, maps, low = _onto(options, onto)
-    _warn(source, maps)
+    for warning in baking.warnings(source, maps):
+        _note(f"warning: {warning}")
     target = options.out or folder / "bake"
     target.mkdir(parents=True, exist_ok=True)
     record = {"run": str(folder), "source" if onto in (None, SOURCE) else "mesh": source.name}
@@ -112,8 +111,7 @@ def _onto(options: argparse.Namespace, onto: str) -> tuple[Mesh, baking.Maps, ba
     from styleexp.runs import origins, reading, results
 
     _check_size(options.size, MOST_ONTO)
-    if find_spec("embreex") is None:
-        raise UserError(baking.MISSING)
+    baking.check_rays()
     path = options.folder / results.NAME
     run = reading.recorded(options.folder, "bake")
     if not path.is_file():
@@ -124,36 +122,10 @@ def _onto(options: argparse.Namespace, onto: str) -> tuple[Mesh, baking.Maps, ba
         detail = from_arrays(stored.vertices, stored.faces)
     except UserError as error:
         raise UserError(f"'{path}' {error}") from None
-    room = baking.cage(mesh, detail.vertices, detail.faces)
-    if options.unwrap or not baking.has_coordinates(mesh):
-        if not options.unwrap:
-            _note(f"'{mesh.name}' has no texture coordinates: unwrapped it, see result_low.glb.")
-        elif mesh.carrier and any(m.baseColorTexture is not None for m in mesh.carrier.materials):
-            _note("left out the textures, which belong to the replaced texture coordinates.")
-        mesh = baking.unwrapped(mesh)
-    low = baking.low(mesh)
-    room = room if options.cage is None else options.cage
-    maps = baking.bake_onto(low, detail.vertices, detail.faces, options.size, room)
-    if (lost := maps.told["filled_from_neighbours"]) > LOST:
-        _note(
-            f"{lost:.1%} of the texels have nothing of the result within {room:.3g} "
-            "and were filled from their neighbours (--cage changes the distance)."
-        )
-    return mesh, maps, low
-
-
-def _warn(source: Mesh, maps: baking.Maps) -> None:
-    if maps.overlap > 0.01:
-        _note(
-            f"warning: {maps.overlap:.0%} of the texture is shared by several faces (mirrored, "
-            "stacked or tiled islands) and keeps only the last face's relief. Unwrap without "
-            "overlaps to keep all."
-        )
-    if source.carrier is not None and source.carrier.flipped.any():
-        _note(
-            "warning: faces of the source's file point inwards, but the maps assume outward "
-            "normals (in Blender: Mesh > Normals > Recalculate Outside)."
-        )
+    low, maps, notes = baking.baked(mesh, detail, options.size, options.cage, options.unwrap)
+    for note in notes:
+        _note(note)
+    return low.mesh, maps, low
 
 
 def _note(what: str) -> None:

@@ -123,11 +123,13 @@ def test_from_drop_to_saved_files(studio, given, tmp_path):
         for kind in ("stl", "maps"):
             page.find_element("css selector", f"#formats input[value='{kind}']").click()
         page.find_element("id", "save").click()
-        wait(page, "document.getElementById('saved').dataset.count === '5'")
+        wait(page, "document.getElementById('saved').dataset.count === '8'")
         assert [each for each in page.get_log("browser") if each["level"] == "SEVERE"] == []
         asked = requests(page)
         assert any(url.startswith(address) for url in asked)
         assert [url for url in asked if not url.startswith((address, "blob:", "data:"))] == []
     names = {path.name for path in folder.glob("*/*") if path.parent.name != "files"}
-    assert {"height.png", "normal.png", "command.txt"} < names
+    maps = {f"{each}.png" for each in ("height", "normal", "occlusion", "curvature")}
+    assert maps | {"command.txt"} < names
+    assert any(name.endswith("_low.glb") for name in names)
     assert {name.rpartition(".")[2] for name in names} == {"glb", "stl", "png", "txt"}

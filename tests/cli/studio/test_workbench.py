@@ -1,5 +1,6 @@
 """The studio without its page: settings, what is made of them, what is saved."""
 
+import json
 import time
 import xml.etree.ElementTree as ET
 import zipfile
@@ -15,6 +16,7 @@ from styleexp.cli.studio.settings import Settings, safe_name
 from styleexp.cli.studio.workbench import Workbench
 from styleexp.inputs import meshes, shapes
 from styleexp.method.synthesis import method as synthesis
+from styleexp.runs import bake
 from styleexp.system.errors import UserError
 
 QUICK = ("source.refine=none", "baseline.bank=600", "threads=1")
@@ -146,10 +148,24 @@ def test_prints_hold_the_same_surface(bench):
     assert trimesh.Trimesh(points, corners).volume == pytest.approx(printed.volume, rel=1e-5)
 
 
-def test_maps_need_texture_coordinates(bench):
+def test_maps_are_laid_on_the_source_as_it_was(bench, files):
+    until(bench, done)
+    saved = {path.name: path for path in bench.save(["maps"], 256)}
+    assert {f"{each}.png" for each in ("height", "normal", "occlusion", "curvature")} < set(saved)
+    low = meshes.load_mesh(saved["sphere-bubble_low.glb"])
+    assert len(low.faces) == len(meshes.load_mesh(files / "sphere.ply").faces)
+    content = saved["sphere-bubble_low.glb"].read_bytes()
+    document = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    assert {"normalTexture", "occlusionTexture"} < set(document["materials"][0])
+    notes = bench.state(-1, 0)["notes"]
+    assert any("has no texture coordinates: unwrapped" in note for note in notes)
+
+
+def test_without_a_library_for_maps_nothing_is_written(bench, monkeypatch):
     until(bench, done)
     before = sorted(bench.folder.iterdir())
-    with pytest.raises(UserError, match="no texture coordinates"):
+    monkeypatch.setattr(bake, "find_spec", lambda name: None)
+    with pytest.raises(UserError, match=r"styleexp\[bake\]"):
         bench.save(["glb", "maps"])
     assert sorted(bench.folder.iterdir()) == before
 

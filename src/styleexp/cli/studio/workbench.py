@@ -30,7 +30,7 @@ from styleexp.inputs import meshes
 from styleexp.inputs.style import Style
 from styleexp.method.base import Result, Scene
 from styleexp.method.synthesis import method as synthesis
-from styleexp.system import process, progress
+from styleexp.system import atomic, process, progress
 from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
@@ -187,24 +187,27 @@ class Workbench:
         if unknown := set(formats) - set(FORMATS):
             raise UserError(f"'{unknown.pop()}' is none of {', '.join(FORMATS)}.")
         stem = "-".join(Path(part).stem for part in (made.settings.source, made.settings.style))
-        if "maps" in formats:
+        low = maps = None
+        if "maps" in formats:  # before anything is written: it may be impossible
             from styleexp.runs import bake
 
-            bake.coordinates(made.result.subject.source)  # before anything is written
+            result = made.result
+            detail = meshes.from_arrays(result.vertices, result.faces)
+            low, maps, notes = bake.baked(self._kept.source(made.settings)[0], detail, size)
+            with self._lock:
+                self._notes = [*self._notes, *notes, *bake.warnings(low.mesh, maps)]
+                self._tell()
         target = _fresh(self.folder / stem)
         written = []
-        for kind in formats:
-            if kind == "maps":
-                subject = made.result.subject
-                maps = bake.bake(
-                    subject.source, made.result.displacement, made.result.vertices, size
-                )
-                target.mkdir(parents=True, exist_ok=True)
-                bake.write(maps, target, "png")
-                written += [target / "height.png", target / "normal.png"]
-            else:
-                made.result.save(target / f"{stem}.{kind}")
-                written.append(target / f"{stem}.{kind}")
+        if low is not None and maps is not None:
+            target.mkdir(parents=True)
+            told = bake.write(maps, target, "png")
+            written += [target / part["file"] for part in told.values() if isinstance(part, dict)]
+            written.append(target / f"{stem}_low.glb")
+            atomic.write(written[-1], atomic.data(bake.glb(low, maps)))
+        for kind in (each for each in formats if each != "maps"):
+            made.result.save(target / f"{stem}.{kind}")
+            written.append(target / f"{stem}.{kind}")
         command = made.settings.command(made.learned > 0)
         (target / "command.txt").write_text(command + "\n", encoding="utf-8")
         return [*written, target / "command.txt"]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,6 +43,8 @@ INSIDE = 1e-3
 APART = 0.05
 """Median distance, in diagonals of the result, above which a mesh is not where the result is.
 Reliefs reach 0.01."""
+LOST = 1e-3
+"""Fraction of texels without a value of their own that is worth a note."""
 ROOM = 1.5
 """The cage's distance, in greatest distances of the result from the mesh."""
 CAGES = (0.001, 0.1)
@@ -89,6 +92,59 @@ def bake(
     normals = vertex_normals(vertices, source.faces)
     drawn, covered, overlap, _ = _drawn(low(source), source.faces, normals, same, size)
     return Maps(drawn[..., 0], drawn[..., 1:4], covered, overlap)
+
+
+def baked(
+    mesh: Mesh, detail: Mesh, size: int, distance: float | None = None, unwrap: bool = False
+) -> tuple[Low, Maps, list[str]]:
+    """Bake a detailed surface onto a mesh in the same place, see `bake_onto`. ``distance`` is the
+    cage's (None: see `cage`). ``unwrap`` makes new texture coordinates, as a mesh without gets in
+    any case. Returns the mesh that was baked to, its maps, and notes for the user.
+
+    Raises `UserError` if the mesh is somewhere else, or Embree or xatlas is missing.
+    """
+    check_rays()
+    room, notes = cage(mesh, detail.vertices, detail.faces), []
+    if unwrap or not has_coordinates(mesh):
+        if not unwrap:
+            notes.append(
+                f"'{mesh.name}' has no texture coordinates: unwrapped it, see result_low.glb."
+            )
+        elif mesh.carrier and any(m.baseColorTexture is not None for m in mesh.carrier.materials):
+            notes.append("left out the textures, which belong to the replaced texture coordinates.")
+        mesh = unwrapped(mesh)
+    target = low(mesh)
+    room = room if distance is None else distance
+    maps = bake_onto(target, detail.vertices, detail.faces, size, room)
+    if (lost := maps.told["filled_from_neighbours"]) > LOST:
+        notes.append(
+            f"{lost:.1%} of the texels have nothing of the result within {room:.3g} "
+            "and were filled from their neighbours (--cage changes the distance)."
+        )
+    return target, maps, notes
+
+
+def check_rays() -> None:
+    """Raise `UserError` if Embree is missing."""
+    if find_spec("embreex") is None:
+        raise UserError(MISSING)
+
+
+def warnings(mesh: Mesh, maps: Maps) -> list[str]:
+    """What is wrong with a mesh's texture coordinates or winding, for the user."""
+    found = []
+    if maps.overlap > 0.01:
+        found.append(
+            f"{maps.overlap:.0%} of the texture is shared by several faces (mirrored, "
+            "stacked or tiled islands) and keeps only the last face's relief. Unwrap without "
+            "overlaps to keep all."
+        )
+    if mesh.carrier is not None and mesh.carrier.flipped.any():
+        found.append(
+            "faces of the source's file point inwards, but the maps assume outward "
+            "normals (in Blender: Mesh > Normals > Recalculate Outside)."
+        )
+    return found
 
 
 def cage(

@@ -170,10 +170,6 @@
     byId("invert-label").hidden = !state.style?.picture;
     byId("learn").textContent = learning() ? "Stop" : "Learn";
     byId("save").disabled = !state.finished;
-    const maps = document.querySelector("#formats input[value=maps]");
-    maps.disabled = !state.source?.uv;
-    maps.parentElement.title = maps.disabled ? "needs a mesh with texture coordinates" : "height and normal map";
-    if (maps.disabled) maps.checked = false;
     byId("command").textContent = state.command;
     byId("notes").replaceChildren(...state.notes.map((note) => {
       const item = document.createElement("li");
