@@ -79,6 +79,9 @@ def test_each_kind_selects_what_it_says(ball, unwrapped, tmp_path):
     assert not slope[y < 0.48].any()
     both = mask_of(ball, ["attribute:right", "height:0.5..1"])
     assert (both == ((x > 0) & (y >= 0))).all()
+    near = mask_of(ball, "near:1/0/0/0.5+-1/0/0/2.5e-1")
+    ends = [np.linalg.norm(ball.vertices - [side, 0, 0], axis=1) for side in (1, -1)]
+    assert (near == ((ends[0] <= 0.5) | (ends[1] <= 0.25))).all()
     left = unwrapped.vertices[:, 0] < 0.5
     assert (mask_of(unwrapped, "not:color:b") == left).all()
     assert mask_of(unwrapped, "color:luminance")[left] == pytest.approx(0.299, abs=1e-6)
@@ -168,6 +171,9 @@ def test_two_runs_with_the_two_halves_put_two_styles_on_one_mesh(tmp_path):
         (("style.mask=north",), "style.mask=north is not a mask: give attribute:NAME, color:"),
         (("style.mask=slope:steep",), "give slope: and 0 to 180 degrees"),
         (("style.mask=height:0.7..0.2",), "give height:LOW..HIGH"),
+        (("style.mask=near:0/1/0",), "give near:X/Y/Z/RADIUS"),
+        (("style.mask=near:0/1/0/0.1+0/1/0/-1",), "the radius above 0"),
+        (("style.mask=near:9/9/9/1",), "selects no vertex"),
         (("style.mask=color:red",), "give color:r|g|b|a|luminance"),
         (("style.mask=attribute:left",), "has no such vertex attribute; it has 'right'"),
         (("style.mask=color:r",), "has no vertex colours"),

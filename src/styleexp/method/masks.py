@@ -28,9 +28,11 @@ CHANNELS = ("r", "g", "b", "a", "luminance")
 OF_THE_FILE = ("attribute", "color", "texture")
 """Mask kinds that need data stored with a file's vertices."""
 KNOWN = (
-    "attribute:NAME, color:r|g|b|a|luminance, texture:FILE, slope:DEGREES or height:LOW..HIGH, "
-    "with the prefix not: to invert it"
+    "attribute:NAME, color:r|g|b|a|luminance, texture:FILE, slope:DEGREES, height:LOW..HIGH or "
+    "near:X/Y/Z/RADIUS, with the prefix not: to invert it"
 )
+NUMBER = r"-?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?"
+BALL = rf"({NUMBER})/({NUMBER})/({NUMBER})/({NUMBER})"
 ROUNDING = 1e-6
 """Tolerance within which mask values snap to 0 or 1."""
 CELLS = 8
@@ -154,7 +156,7 @@ def _term(given: Any) -> Term:
     text = str(given)
     rest = text.removeprefix("not:")
     kind, colon, value = rest.partition(":")
-    known = colon and value and kind in (*OF_THE_FILE, "slope", "height")
+    known = colon and value and kind in (*OF_THE_FILE, "slope", "height", "near")
     if not isinstance(given, str) or not known:
         raise UserError(f"style.mask={text} is not a mask: give {KNOWN}.")
     if kind == "color" and value not in CHANNELS:
@@ -163,6 +165,8 @@ def _term(given: Any) -> Term:
         raise UserError(f"style.mask={text} is not allowed: give slope: and 0 to 180 degrees.")
     if kind == "height":
         _band(text, value)
+    if kind == "near":
+        _balls(text, value)
     return Term(text, kind, value, text != rest)
 
 
@@ -181,6 +185,17 @@ def _band(text: str, value: str) -> tuple[float, float]:
     return _number(low), _number(high)
 
 
+def _balls(text: str, value: str) -> Float[np.ndarray, "balls 4"]:
+    """Centres and radii of balls, ``X/Y/Z/RADIUS`` joined by ``+``."""
+    balls = np.array(re.findall(BALL, value), dtype=np.float64)
+    if not re.fullmatch(rf"{BALL}(?:\+{BALL})*", value) or not (balls[:, 3] > 0).all():
+        raise UserError(
+            f"style.mask={text} is not allowed: give near:X/Y/Z/RADIUS in the source's own "
+            "coordinates, the radius above 0; several are joined by +."
+        )
+    return balls
+
+
 def _values(term: Term, source: Mesh) -> Float[np.ndarray, " vertices"]:
     """Evaluate a term at the source's vertices, 0 to 1."""
     found = {
@@ -189,6 +204,7 @@ def _values(term: Term, source: Mesh) -> Float[np.ndarray, " vertices"]:
         "texture": _texture,
         "slope": _slope,
         "height": _height,
+        "near": _near,
     }[term.kind](term, source)
     # Snap values that differ from 0 or 1 by rounding, so that no relief leaks out.
     found = np.where(found < ROUNDING, 0.0, np.where(found > 1 - ROUNDING, 1.0, found))
@@ -263,3 +279,13 @@ def _height(term: Term, source: Mesh) -> np.ndarray:
     y = source.vertices[:, 1]
     share = (y - y.min()) / (np.ptp(y) or 1.0)
     return ((share >= low) & (share <= high)).astype(np.float64)
+
+
+def _near(term: Term, source: Mesh) -> np.ndarray:
+    from scipy.spatial import cKDTree
+
+    inside = np.zeros(len(source.vertices))
+    tree = cKDTree(source.vertices)
+    for *centre, radius in _balls(term.text, term.value):
+        inside[tree.query_ball_point(centre, radius)] = 1.0
+    return inside

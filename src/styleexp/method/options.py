@@ -41,7 +41,8 @@ class StyleConfig:
     ``color:CHANNEL`` (vertex colour channel: r, g, b, a or luminance), ``texture:FILE`` (an image's
     luminance at the source's texture coordinates, row 0 at the top, repeated), ``slope:DEGREES``
     (normals within this angle of up, +Y), ``height:LOW..HIGH`` (fractions of the source's height
-    along +Y). Prefix ``not:`` inverts a mask."""
+    along +Y), ``near:X/Y/Z/RADIUS`` (within a ball, in the source's own coordinates; several balls
+    are joined by ``+``). Prefix ``not:`` inverts a mask."""
     falloff: float = option(0.05, between=(0.0, 2.0))
     """Width of the mask's soft border, in radii of the normalised source, half on each side. 0:
     hard border."""

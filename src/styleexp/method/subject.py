@@ -151,7 +151,7 @@ def measure(
             *(f"style: {repair}" for repair in style.repairs),
             *stray_faces("source", source),
             *(stray_faces("style", style.mesh) if style.mesh is not None else ()),
-            *too_coarse(source, 1 / sigma),
+            *too_coarse(source, 1 / sigma, settings.source.refine),
             *share,
             *mistaken(settings.style, style, heights),
             *(no_relief(style) if smooth else ()),
@@ -224,16 +224,20 @@ def choose_field(
     return sigma, bound, height
 
 
-def too_coarse(mesh: meshes.Mesh, wavelength: float) -> list[str]:
-    """A note if the mesh's edges are too long for details of this size, in radii."""
+def too_coarse(mesh: meshes.Mesh, wavelength: float, refine: str) -> list[str]:
+    """A note if the mesh's edges are too long for details of this size, in radii, although it was
+    refined as ``source.refine`` says."""
     edge = meshes.mean_edge_length(mesh.vertices, mesh.faces)
     edge /= meshes.normalisation(mesh.vertices).scale
     if edge <= wavelength / 4:
         return []
+    way = {
+        "none": "add source.refine=auto, which keeps texture coordinates",
+        "auto": "a larger style.scale makes them larger",
+    }.get(refine, f"source.refine={refine} is too few faces, auto takes as many as it needs")
     return [
         f"'{mesh.name}' is too coarse for this style: its edges are {edge:.3f} radii long, and the "
-        f"style's details about {wavelength:.3f}; add source.refine=auto, which keeps texture "
-        "coordinates."
+        f"style's details about {wavelength:.3f}; {way}."
     ]
 
 

@@ -5,10 +5,12 @@ import json
 import subprocess
 import sys
 import threading
+import time
 
 import numpy as np
 import pytest
 from PIL import Image
+from selenium.webdriver.common.action_chains import ActionChains
 
 from styleexp.inputs import meshes, shapes
 from tests.helpers.browser import browser, covered, pixels, requests, wait
@@ -39,8 +41,8 @@ def studio(tmp_path_factory):
     folder = tmp_path_factory.mktemp("studio")
     mesh = shapes.make("bubble", 3000)
     meshes.save_mesh(mesh, mesh.vertices, folder / "bubble.ply")
-    command = [sys.executable, "-m", "styleexp.cli.studio", "sphere", "bubble.ply", *QUICK]
-    command += ["--no-browser", "--out", "made"]
+    command = [sys.executable, "-m", "styleexp.cli.studio", "sphere", "bubble.ply"]
+    command += ["--no-browser", "--out", "made", *QUICK]
     with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as process:
         try:
             address = process.stdout.readline().split()[-1]
@@ -86,6 +88,21 @@ def test_what_does_not_fit_is_one_sentence(studio):
     assert not list(folder.parent.rglob("evil.sh"))
 
 
+def paint(page, kind):
+    """Choose a brush and drag over the middle of the result."""
+    page.execute_script(
+        f"const s = document.getElementById('where'); s.value = '{kind}';"
+        "s.dispatchEvent(new Event('change'));"
+    )
+    drag = ActionChains(page).move_to_element(page.find_element("id", "strokes")).click_and_hold()
+    drag.move_by_offset(60, 0).move_by_offset(60, 0).release().perform()
+
+
+def shown(page):
+    """How many results the page has shown."""
+    return int(page.execute_script("return document.getElementById('stage').dataset.shown"))
+
+
 def test_from_drop_to_saved_files(studio, given, tmp_path):
     address, folder = studio
     with browser(tmp_path, width=1300, height=1000) as page:
@@ -116,6 +133,20 @@ def test_from_drop_to_saved_files(studio, given, tmp_path):
         wait(page, done)
         wait(page, "Number(document.getElementById('stage').dataset.shown) > 2")
         assert np.abs(pixels(page, "#view-result") - before).mean() > 0.5
+
+        before, looks = pixels(page, "#view-result"), shown(page)
+        paint(page, "near")
+        wait(page, "document.getElementById('command').textContent.includes('=near:')")
+        wait(page, f"Number(document.getElementById('stage').dataset.shown) > {looks}")
+        wait(page, done)
+        time.sleep(1.5)  # the strokes fade
+        # Away from the brush it is a ball again.
+        left = np.abs(pixels(page, "#view-result") - before)[:, : before.shape[1] // 3]
+        assert left.mean() > 5
+        assert "the relief covers" in page.find_element("id", "notes").text
+        page.find_element("id", "unpaint").click()
+        wait(page, "!document.getElementById('command').textContent.includes('near')")
+        wait(page, done)
 
         page.get(address)  # as after a closed tab
         wait(page, done)

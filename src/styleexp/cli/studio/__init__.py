@@ -23,7 +23,7 @@ this machine can open the page. Needs the extra studio."""
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve the page until Ctrl-C; return 0, or 2 after printing a user error."""
-    options = _parser().parse_args(arguments)
+    options = _parser().parse_intermixed_args(arguments)
     try:
         missing = [name for name in ("starlette", "uvicorn") if find_spec(name) is None]
         if missing:

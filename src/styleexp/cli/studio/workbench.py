@@ -362,7 +362,15 @@ class Workbench:
             self._made = Made(result, settings, finished, learned)
             self._looks["result"] = Look(self._version + 1, content)
             self._notes = list(result.subject.notes)
-            self._tell(result={"vertices": len(result.vertices), "faces": len(result.faces)})
+            self._tell(
+                result={
+                    "vertices": len(result.vertices),
+                    "faces": len(result.faces),
+                    # Shown positions, times scale, plus center, are those of the source's file.
+                    "center": frame.center.tolist(),
+                    "scale": frame.scale,
+                }
+            )
 
 
 def too_large(what: str) -> str:

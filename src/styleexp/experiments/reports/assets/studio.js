@@ -44,10 +44,13 @@
   byId("steps").addEventListener("change", () => change("steps", Number(byId("steps").value)));
   byId("again").addEventListener("click", () => change("seed", state.settings.seed + 1));
   byId("where").addEventListener("change", () => {
-    const own = byId("where").value === "own";
-    byId("mask-label").hidden = !own;
-    if (own) byId("mask").focus();
-    else change("mask", byId("where").value);
+    const value = byId("where").value;
+    byId("mask-label").hidden = value !== "own";
+    byId("brush").hidden = !BRUSHES.has(value);
+    if (BRUSHES.has(value)) paint(true);
+    else if (value === "own") byId("mask").focus();
+    else change("mask", value);
+    if (!BRUSHES.has(value)) paint(false);
   });
   byId("learn").addEventListener("click", () => attempt(() => post(learning() ? "stop" : "learn")));
   const learning = () => /learning/.test(state.stage);
@@ -85,6 +88,56 @@
   }
   // A file dropped beside its place must not replace the page.
   for (const kind of ["dragover", "drop"]) addEventListener(kind, (event) => event.preventDefault());
+
+  // ---------------------------------------------------------------- brush
+  // Its strokes are balls in the source's coordinates, as style.mask takes them.
+  const BRUSHES = new Map([["not:near", "not where I paint"], ["near", "only where I paint"]]);
+  const MOST_BALLS = 120;
+  const painted = (mask) => {
+    const [, kind, balls] = mask.match(/^((?:not:)?near):(\S+)$/) || [];
+    return { kind, balls: balls ? balls.split("+") : [] };
+  };
+  const strokes = byId("strokes");
+  let stroke = null;
+  function paint(on) {
+    byId("paint").setAttribute("aria-pressed", String(on));
+    strokes.hidden = !on;
+  }
+  function touch(event) {
+    const viewer = byId("view-result"), box = strokes.getBoundingClientRect();
+    const hit = viewer.positionAndNormalFromPoint(event.clientX, event.clientY);
+    if (!hit || !state.result) return;
+    const { center, scale } = state.result, size = Number(byId("brush-size").value);
+    const at = ["x", "y", "z"].map((axis) => hit.position[axis]);
+    const far = stroke.every((each) => Math.hypot(...each.at.map((x, k) => x - at[k])) > 0.6 * size);
+    if (!far) return;
+    stroke.push({ at, text: [...at.map((x, k) => x * scale + center[k]), size * scale].map((x) => Number(x.toPrecision(4))).join("/") });
+    const pen = strokes.getContext("2d"), away = viewer.getCameraOrbit().radius;
+    const reach = (size / away / Math.tan((viewer.getFieldOfView() * Math.PI) / 360)) * (box.height / 2);
+    pen.fillStyle = byId("where").value === "near" ? "rgba(40, 160, 90, 0.35)" : "rgba(210, 60, 40, 0.35)";
+    pen.beginPath();
+    pen.arc(event.clientX - box.left, event.clientY - box.top, reach, 0, 7);
+    pen.fill();
+  }
+  strokes.addEventListener("pointerdown", (event) => {
+    strokes.width = strokes.clientWidth;
+    strokes.height = strokes.clientHeight;
+    strokes.setPointerCapture(event.pointerId);
+    stroke = [];
+    touch(event);
+  });
+  strokes.addEventListener("pointermove", (event) => { if (stroke) touch(event); });
+  strokes.addEventListener("pointerup", () => {
+    const kind = byId("where").value, before = painted(state.settings.mask);
+    const balls = [...(before.kind === kind ? before.balls : []), ...stroke.map(({ text }) => text)];
+    if (balls.length > MOST_BALLS) complain(`This is more than ${MOST_BALLS} dabs: take a larger brush, or paint a mask in your modelling program.`);
+    else if (stroke.length) change("mask", `${kind}:${balls.join("+")}`);
+    stroke = null;
+    setTimeout(() => strokes.getContext("2d").clearRect(0, 0, strokes.width, strokes.height), 800);
+  });
+  byId("paint").addEventListener("click", () => paint(strokes.hidden));
+  byId("unpaint").addEventListener("click", () => change("mask", ""));
+  byId("brush-size").addEventListener("input", () => { document.querySelector("output[for=brush-size]").value = byId("brush-size").value; });
 
   // ---------------------------------------------------------------- saving
   byId("save").addEventListener("click", () => attempt(async () => {
@@ -130,16 +183,20 @@
   function places() {
     const attributes = state.source?.attributes || [];
     const all = [...WHERE, ...attributes.flatMap((name) =>
-      [[`attribute:${name}`, `where ${name} is high`], [`not:attribute:${name}`, `where ${name} is low`]]), ["own", "custom mask …"]];
+      [[`attribute:${name}`, `where ${name} is high`], [`not:attribute:${name}`, `where ${name} is low`]]), ...BRUSHES, ["own", "custom mask …"]];
     const key = JSON.stringify(all);
     if (byId("where").dataset.key !== key) {
       byId("where").dataset.key = key;
       byId("where").replaceChildren(...all.map(([value, text]) => new Option(text, value)));
     }
-    const mask = state.settings.mask, known = all.some(([value]) => value === mask);
-    if (document.activeElement !== byId("mask") && document.activeElement !== byId("where")) {
-      byId("where").value = known ? mask : "own";
+    const mask = state.settings.mask, choice = painted(mask).kind || mask;
+    const known = all.some(([value]) => value === choice);
+    // An empty mask leaves a brush that was chosen as it is.
+    const brushing = !mask && BRUSHES.has(byId("where").value);
+    if (document.activeElement !== byId("mask") && document.activeElement !== byId("where") && !brushing) {
+      byId("where").value = known ? choice : "own";
       byId("mask-label").hidden = known;
+      byId("brush").hidden = !BRUSHES.has(choice);
       byId("mask").value = mask;
     }
     byId("falloff-label").hidden = !mask;
