@@ -4,6 +4,7 @@ promise that the site asks nothing of the network."""
 import dataclasses
 import importlib
 import io
+import os
 import re
 import typing
 from contextlib import redirect_stdout, suppress
@@ -24,7 +25,7 @@ API = {
     "Synthesis on the surface": ("method.synthesis", "method.synthesis.method", "method.synthesis.shape", "method.synthesis.exemplar",
                                  "method.synthesis.direction", "method.synthesis.walk", "method.synthesis.optimise", "method.synthesis.room"),
     "Meshes and pictures": ("inputs.meshes", "inputs.meshes.mesh", "inputs.meshes.reading", "inputs.meshes.writing",
-                            "inputs.meshes.remeshing", "inputs.meshes.refining", "inputs.meshes.memory", "inputs.meshes.welding", "inputs.meshes.joining", "inputs.meshes.precision",
+                            "inputs.meshes.remeshing", "inputs.meshes.refining", "inputs.meshes.simplifying", "inputs.meshes.memory", "inputs.meshes.welding", "inputs.meshes.joining", "inputs.meshes.precision",
                             "inputs.meshes.gltf", "inputs.meshes.accessors", "inputs.meshes.gltf_writing", "inputs.meshes.gltf_making",
                             "inputs.meshes.ply", "inputs.meshes.ply_meshes", "inputs.meshes.obj", "inputs.deep_images", "inputs.images", "inputs.shapes", "inputs.assets", "config.sources"),
     "Baking": ("runs.bake", "runs.bake.low", "runs.bake.tangents", "runs.bake.texels", "runs.bake.detail", "runs.bake.files", "runs.bake.glb"),
@@ -35,7 +36,7 @@ API = {
                   "renderers.mitsuba_ad", "renderers.moderngl_deferred"),
     "Encoders": ("encoders", "encoders.base", "encoders.vgg", "encoders.fused", "encoders.clip", "inputs.weights"),
     "Parts and plugins": ("plugins", "plugins.spec", "plugins.code", "plugins.catalogue", "plugins.loggers", "testing", "testing.renderers", "testing.losses", "testing.fields", "testing.encoders", "testing.styles", "testing.methods", "system.options", "system.errors"),
-    "Runs, metrics, reports": ("runs.records", "runs.reading", "runs.finding", "runs.jobs", "runs.results", "runs.untrusted", "runs.identity", "runs.origins", "runs.provenance", "experiments.execute", "experiments.reproduce", "experiments.metrics", "experiments.metrics.style", "experiments.metrics.shape",
+    "Runs, metrics, reports": ("runs.records", "runs.reading", "runs.finding", "runs.jobs", "runs.results", "runs.untrusted", "runs.identity", "runs.origins", "runs.exports", "runs.provenance", "experiments.execute", "experiments.reproduce", "experiments.metrics", "experiments.metrics.style", "experiments.metrics.shape",
                                "experiments.metrics.truth", "experiments.reports", "experiments.reports.collect",
                                "experiments.reports.compare_page", "experiments.reports.reliability", "experiments.reports.study_results", "experiments.sweeps.claim", "experiments.sweeps.costs", "experiments.sweeps.plan", "experiments.sweeps.preflight", "experiments.sweeps.runner", "experiments.sweeps.state", "experiments.agreement", "method.gram_cache", "experiments.bench.render", "experiments.bench.step"),
 }  # fmt: skip
@@ -58,6 +59,12 @@ title: styleexp.{0}
 SHIM = "https://unpkg.com/iframe-worker/shim"
 LINK = re.compile(r"\[([^\]]+)\]\((\.\./[^)#\s]+)(#[^)\s]*)?\)")
 OBJECT = re.compile(r"`(styleexp\.[\w.]+)`")
+
+
+def on_config(config):
+    """Offer the other versions, where `mike` keeps them; a single site has no such list."""
+    if "MIKE_DOCS_VERSION" in os.environ:
+        config.extra["version"] = {"provider": "mike"}
 
 
 def on_files(files, config):
