@@ -72,7 +72,7 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/python -m pip check
 
 docs: $(VENV)/.installed-dev
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo site/index.html
 
 blender:
