@@ -64,6 +64,15 @@ def _sample(name: str, sha: str) -> Asset:
 ASSETS: dict[str, Asset] = {
     asset.name: asset
     for asset in (
+        Asset(
+            "critter_low",
+            "mesh",
+            "critter_low.glb",
+            "MIT",
+            "styleexp",
+            "part of this package (examples/low_poly.py)",
+            "0c994678067a4bdc80ed85b6a0843a8c3aa6861f17d4adef5b01e7abd5e14ab6",
+        ),
         _mesh(
             "armadillo",
             _STANFORD,

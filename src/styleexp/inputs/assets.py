@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+SHIPPED = Path(__file__).parent / "shipped"
+"""Files that are part of this package."""
 TIMEOUT = 20
 """Seconds without an answer after which a server counts as out of reach."""
 
@@ -139,7 +141,7 @@ def _check_kind(kind: str) -> str:
 
 
 def _folders(kind: str) -> Iterator[Path]:
-    for folder in [*search_path(), cache_dir()]:
+    for folder in [*search_path(), cache_dir(), SHIPPED]:
         yield folder
         yield folder / FOLDERS[_check_kind(kind)]
 

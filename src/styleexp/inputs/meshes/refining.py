@@ -8,14 +8,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from styleexp.inputs.meshes.flipping import flipped
 from styleexp.inputs.meshes.mesh import Carrier, Mesh, vertex_normals
 from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-ROUNDS = 12
-"""Maximum number of rounds; each splits the longest edges."""
+ROUNDS = 30
+"""Maximum number of rounds."""
+NEARLY = 0.7
+"""An edge is split once it is longer than this share of the longest edge of every face at it, so
+that thin triangles become shorter before they become smaller."""
 CREASE = 0.8
 """Cosine between a vertex normal and a face normal below which the vertex is on a crease; its edges
 stay straight."""
@@ -51,6 +55,8 @@ def refine(mesh: Mesh, longest: float) -> Mesh:
         split = length > longest
         if not split.any():
             break
+        of_faces = length[of_face]
+        split[of_face[of_faces < NEARLY * of_faces.max(axis=1, keepdims=True)]] = False
         if len(faces) + 2 * split.sum() > MOST_FACES:
             raise UserError(
                 f"'{mesh.name}' would need more than {MOST_FACES:,} faces for this relief: "
@@ -58,6 +64,7 @@ def refine(mesh: Mesh, longest: float) -> Mesh:
             )
         outward = np.where(carrier.flipped[:, None], faces[:, ::-1], faces)
         vertices, carrier = _split(vertices, carrier, outward, edges, of_face, split)
+        carrier = flipped(vertices, carrier, longest)
     if len(carrier.corners) == before:
         return mesh
     left_out = "skins, animations and other glTF data" if carrier.document else ""

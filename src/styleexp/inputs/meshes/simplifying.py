@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from styleexp.inputs.meshes.flipping import groups
 from styleexp.inputs.meshes.mesh import Carrier, Mesh
 from styleexp.system.errors import UserError
 
@@ -105,10 +106,7 @@ def _apart(
 ) -> tuple[Int[np.ndarray, " more"], Int[np.ndarray, "faces 3"], Int[np.ndarray, " more"]]:
     """Rows, corners and the first face of each row, where rows of faces of another material, part,
     group, colour or winding are others, so that a face's rows tell all of these."""
-    columns = [carrier.flipped, carrier.face_part, carrier.face_material, carrier.face_colors]
-    columns += [of for _, of in carrier.labels.values()]
-    told = np.column_stack([each for each in columns if each is not None]).astype(np.int64)
-    group = np.unique(told, axis=0, return_inverse=True)[1].ravel()
+    group = groups(carrier)
     keys = carrier.corners * (int(group.max()) + 1) + group[:, None]
     _, first, corners = np.unique(keys, return_index=True, return_inverse=True)
     return carrier.corners.ravel()[first], corners.reshape(-1, 3), first // 3
