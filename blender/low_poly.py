@@ -80,9 +80,6 @@ def stage() -> None:
     background = scene.world.node_tree.nodes["Background"].inputs
     background["Color"].default_value = (0.8, 0.85, 0.9, 1)
     background["Strength"].default_value = 0.5
-        (0.8, 0.85, 0.9, 1),
-        0.5,
-    )
 
 
 def main(mesh: Path, run: Path, target: Path) -> None:
