@@ -429,9 +429,12 @@ def test_a_refusal_loads_no_torch_and_leaves_no_folder(arguments, told, tmp_path
     assert {path.name for path in tmp_path.iterdir()} == {"scene.fbx", "part.step"}
 
 
-def test_help_may_be_cut_off(tmp_path):
+@pytest.mark.parametrize(
+    "words", ["styleexp --help", "styleexp.cli.assets list", "styleexp.cli.plugins"]
+)
+def test_what_is_printed_may_be_cut_off(words, tmp_path):
     done = subprocess.run(
-        f"{sys.executable} -m styleexp --help | head -2",
+        f"{sys.executable} -m {words} | head -2",
         shell=True, cwd=tmp_path, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.stderr == ""

@@ -7,10 +7,12 @@ import json
 import sys
 from collections.abc import Sequence
 
+from styleexp.cli.ending import ends_well
 from styleexp.inputs import assets
 from styleexp.system.errors import UserError, unknown_name
 
 
+@ends_well
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, or 2 after printing a user error."""
     options = _parser().parse_args(arguments)

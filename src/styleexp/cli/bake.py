@@ -11,6 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from styleexp.cli.ending import ends_well
 from styleexp.system import atomic
 from styleexp.system.errors import UserError
 
@@ -31,6 +32,7 @@ SOURCE = "source"
 """Value of ``--onto`` for the run's own source."""
 
 
+@ends_well
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, or 2 after printing a user error."""
     options = _parser().parse_args(arguments)
@@ -40,6 +42,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"styleexp-bake: {error}", file=sys.stderr)
         return 2
+    except BrokenPipeError:
+        raise
     except OSError as error:
         where = f"'{error.filename}'" if error.filename else "the maps"
         print(f"styleexp-bake: {where} cannot be written ({error.strerror}).", file=sys.stderr)

@@ -10,11 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from styleexp.cli.answers import answer
+from styleexp.cli.ending import ends_well
 from styleexp.system.errors import UserError
 
 FACES = "5000, 20000, 80000, 320000, 1280000"
 
 
+@ends_well
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, or 2 after printing a user error."""
     parser = _parser()

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from styleexp.cli.answers import answer
+from styleexp.cli.ending import ends_well
 from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ SHOWN = (
 )
 
 
+@ends_well
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, or 2 after printing a user error."""
     parser = _parser()

@@ -10,8 +10,10 @@ import warnings
 from collections.abc import Sequence
 
 from styleexp import plugins
+from styleexp.cli.ending import ends_well
 
 
+@ends_well
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; unusable plugins are listed and don't count as a failure."""
     parser = argparse.ArgumentParser(

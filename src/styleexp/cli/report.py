@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from styleexp.cli.ending import ends_well
 from styleexp.system.errors import UserError
 
 DESCRIPTION = """\
@@ -14,6 +15,7 @@ Write one self-contained HTML page about a run, about all runs below a folder, o
 side by side, and print its path. For the user study, see 'styleexp-report study --help'."""
 
 
+@ends_well
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, or 2 after printing a user error."""
     given = list(sys.argv[1:] if arguments is None else arguments)
@@ -24,6 +26,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"styleexp-report: {error}", file=sys.stderr)
         return 2
+    except BrokenPipeError:
+        raise
     except OSError as error:
         where = f"'{error.filename}'" if error.filename else "the page"
         print(f"styleexp-report: {where} cannot be written ({error.strerror}).", file=sys.stderr)

@@ -6,11 +6,13 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from styleexp.cli.ending import ends_well
 from styleexp.system.errors import UserError
 
 NAME = "reproduce"
 
 
+@ends_well
 def main(arguments: Sequence[str]) -> int:
     """Run the command; return 0 if all is equal, 1 if the results differ. Raises `UserError`."""
     options = _parser().parse_args(arguments)
@@ -20,6 +22,8 @@ def main(arguments: Sequence[str]) -> int:
 
     try:
         return reproduce(options.folder, options.out)
+    except BrokenPipeError:
+        raise
     except OSError as error:
         where = f"'{error.filename}'" if error.filename else "a file"
         raise UserError(f"{where} can't be read or written ({error.strerror or error}).") from error

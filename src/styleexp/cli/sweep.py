@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from styleexp.cli.ending import ends_well
 from styleexp.system import gpus
 from styleexp.system.errors import UserError
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from styleexp.experiments.sweeps.plan import Plan, Planned
 
 
+@ends_well
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0 if all jobs are done, else 2, also after a user error."""
     given = list(sys.argv[1:] if arguments is None else arguments)
@@ -126,6 +128,8 @@ def _run(options: argparse.Namespace) -> int:
         runner.run(jobs, folder, launcher, options.per_task)
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(explain(error)) from error
+    except BrokenPipeError:
+        raise
     except OSError as error:
         raise UserError(f"writing to '{folder}' failed: {error}.") from error
     return _report(read, by_entry, folder)

@@ -13,6 +13,7 @@ from datetime import datetime
 from importlib.util import find_spec
 from pathlib import Path
 
+from styleexp.cli.ending import ends_well
 from styleexp.system.errors import UserError
 
 DESCRIPTION = """\
@@ -21,6 +22,7 @@ direction and mask, and save the mesh, its height and normal maps, and the equiv
 this machine can open the page. Needs the extra studio."""
 
 
+@ends_well
 def main(arguments: Sequence[str] | None = None) -> int:
     """Serve the page until Ctrl-C; return 0, or 2 after printing a user error."""
     options = _parser().parse_intermixed_args(arguments)
