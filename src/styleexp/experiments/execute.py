@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from styleexp.config.schema import Config
+    from styleexp.experiments.sweeps.pruning import Trial
     from styleexp.method.base import Method, Result, Scene, State, Step
     from styleexp.plugins.loggers import Loggers
 
@@ -45,9 +46,10 @@ def run(
     overrides: list[str],
     again: bool = True,
     command: list[str] | None = None,
+    trial: Trial | None = None,
 ) -> int:
     """Stylise and write everything into ``folder``; return the exit code. ``command`` is recorded;
-    by default it is ``styleexp`` with the overrides.
+    by default it is ``styleexp`` with the overrides. A ``trial`` ends early where it is hopeless.
 
     Without ``again``, as in a sweep, a finished run isn't repeated, and a different run in the
     folder is an error instead of being replaced, unless it failed, or differs only in the code of
@@ -57,8 +59,8 @@ def run(
         if not again:
             job = Job(folder.name, tuple(overrides), folder, identity.job_key(config))
             found = reading.of_job(job)
-            if found.status == "done":
-                print(f"already done: {folder}")
+            if found.status in ("done", "pruned"):
+                print(f"already {found.status}: {folder}")
                 return 0
             if found.status == "other" and found.last_status != "failed":
                 edited = identity.edited_since(config, overrides, reading.read(folder).record)
@@ -69,11 +71,15 @@ def run(
                     )
                 told = " and ".join(edited)
                 print(f"note: the run in '{folder}' was of other code of {told}: running it again")
-        return begin(config, folder, overrides, command)
+        return begin(config, folder, overrides, command, trial)
 
 
 def begin(
-    config: Config, folder: Path, overrides: list[str], command: list[str] | None = None
+    config: Config,
+    folder: Path,
+    overrides: list[str],
+    command: list[str] | None = None,
+    trial: Trial | None = None,
 ) -> int:
     """Stylise into a folder whose lock is held; return the exit code.
 
@@ -89,7 +95,8 @@ def begin(
             f"note: replacing the unfinished run in '{folder}', which had other settings, files or "
             "another version"
         )
-    return _guarded(config, run_folder, unfinished or record, resumed=unfinished is not None)
+    resumed = unfinished is not None
+    return _guarded(config, run_folder, unfinished or record, resumed, trial)
 
 
 def resume(folder: Path) -> int:
@@ -120,7 +127,11 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 def _guarded(
-    config: Config, folder: records.RunFolder, record: dict[str, Any], resumed: bool
+    config: Config,
+    folder: records.RunFolder,
+    record: dict[str, Any],
+    resumed: bool,
+    trial: Trial | None = None,
 ) -> int:
     """Execute the run, and write its final status in any case; return the exit code."""
     if resumed:
@@ -136,7 +147,7 @@ def _guarded(
         if not replaces:
             folder.begin(None if resumed else record)
         with announced():
-            return _execute(config, folder, record, resumed, look)
+            return _execute(config, folder, record, resumed, look, trial)
     except BrokenPipeError:  # as with `styleexp ... | head`; not the folder's fault
         folder.write_status("interrupted", reason="the output pipe was closed")
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -174,6 +185,7 @@ def _execute(
     record: dict[str, Any],
     resumed: bool,
     look: live.Live,
+    trial: Trial | None,
 ) -> int:
     """Prepare, optimise, write and measure; return the exit code."""
     from styleexp.config import build
@@ -197,8 +209,10 @@ def _execute(
 
     step = state.step if state else 0
     with Loggers(config, folder.path, record, step) as loggers:
-        if state is not None and not _optimise(method, scene, state, config, folder, loggers, look):
-            return INTERRUPTED
+        if state is not None:
+            code = _optimise(method, scene, state, config, folder, loggers, look, trial, started)
+            if code is not None:
+                return code
         result = method.finish(scene, state)
         look.result(result)
         step = state.step if state else 0
@@ -296,8 +310,11 @@ def _optimise(
     folder: records.RunFolder,
     loggers: Loggers,
     look: live.Live,
-) -> bool:
-    """Run the remaining steps; return False if the user stopped them."""
+    trial: Trial | None,
+    started: float,
+) -> int | None:
+    """Run the remaining steps; return the exit code if they end early: stopped by the user, or a
+    hopeless trial."""
     optim = config.optim
     blank = 0
     with endings.interruptible() as interrupted:
@@ -307,13 +324,27 @@ def _optimise(
             loggers.step(step)
             look.step(step, optim.steps, lambda: method.finish(scene, state))
             blank += getattr(step, "blank_views", 0)
+            # Before this step's checkpoint: a trial that goes on from it has been judged.
+            if trial and trial.due(state.step, optim.steps):
+                doing("measuring the trial")
+                result = method.finish(scene, state)
+                reason = trial.verdict(state.step, _measure(result, config))
+                doing("")
+                if reason is not None:
+                    look.result(result)
+                    seconds = round(time.perf_counter() - started, 1)
+                    folder.write_status("pruned", step=state.step, reason=reason, seconds=seconds)
+                    folder.save_checkpoint(state)
+                    loggers.ended = "interrupted"
+                    print(f"pruned: {reason}")
+                    return 0
             if state.step % optim.checkpoint_every == 0 or interrupted:
                 folder.save_checkpoint(state)
             if interrupted and state.step < optim.steps:
                 folder.write_status("interrupted", step=state.step)
                 loggers.ended = "interrupted"
                 print(f"\nstopped at step {state.step}; continue with: {_resuming(folder)}")
-                return False
+                return INTERRUPTED
     if folder.checkpoint_step() != state.step:
         folder.save_checkpoint(state)
     if blank:
@@ -321,7 +352,7 @@ def _optimise(
         print(
             f"note: {blank} views did not show the mesh and {what} (blank_views in metrics.jsonl)"
         )
-    return True
+    return None
 
 
 def _explained(steps: Iterator[Step], folder: records.RunFolder) -> Iterator[Step]:
