@@ -24,12 +24,15 @@ from styleexp.system.errors import UserError
 from styleexp.system.progress import announced, doing
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from styleexp.config.schema import Config
+    from styleexp.experiments.metrics import Banks, Judge
     from styleexp.experiments.sweeps.pruning import Trial
     from styleexp.method.base import Method, Result, Scene, State, Step
     from styleexp.plugins.loggers import Loggers
+
+    Measure = Callable[[Result], dict[str, float]]
 
 SHOWN_METRICS = ("style_distance", "silhouette_iou", "flipped_faces")
 """Metrics printed at the end of a run."""
@@ -207,16 +210,19 @@ def _execute(
     record |= _determined(scene, config, assets)
     folder.write_json("run.json", record)
 
+    measure = _measuring(config)
     step = state.step if state else 0
     with Loggers(config, folder.path, record, step) as loggers:
         if state is not None:
-            code = _optimise(method, scene, state, config, folder, loggers, look, trial, started)
+            code = _optimise(
+                method, scene, state, config, folder, loggers, look, trial, measure, started
+            )
             if code is not None:
                 return code
         result = method.finish(scene, state)
         look.result(result)
         step = state.step if state else 0
-        written, measured = _write_results(result, config, folder)
+        written, measured = _write_results(result, config, folder, measure)
         seconds = time.perf_counter() - started
         if config.report:  # last, because it shows the other files
             from styleexp.experiments.reports import page
@@ -311,6 +317,7 @@ def _optimise(
     loggers: Loggers,
     look: live.Live,
     trial: Trial | None,
+    measure: Measure,
     started: float,
 ) -> int | None:
     """Run the remaining steps; return the exit code if they end early: stopped by the user, or a
@@ -328,7 +335,7 @@ def _optimise(
             if trial and trial.due(state.step, optim.steps):
                 doing("measuring the trial")
                 result = method.finish(scene, state)
-                reason = trial.verdict(state.step, _measure(result, config))
+                reason = trial.verdict(state.step, measure(result))
                 doing("")
                 if reason is not None:
                     look.result(result)
@@ -373,7 +380,7 @@ def _explained(steps: Iterator[Step], folder: records.RunFolder) -> Iterator[Ste
 
 
 def _write_results(
-    result: Result, config: Config, folder: records.RunFolder
+    result: Result, config: Config, folder: records.RunFolder, measure: Measure
 ) -> tuple[list[Path], dict[str, float]]:
     """Write, draw and measure the result; return the files to name to the user, and the metrics."""
     from styleexp import plugins
@@ -388,7 +395,7 @@ def _write_results(
     names = ("preview.png", "turntable.gif", *meshes)
     written = [folder.path / name for name in names]
     doing("measuring the result")
-    measured = _measure(result, config)
+    measured = measure(result)
     doing("")
     folder.write_json("metrics.json", measured)
     shown = [name for name in SHOWN_METRICS if name in measured]
@@ -401,16 +408,26 @@ def _write_results(
     return written, measured
 
 
-def _measure(result: Result, config: Config) -> dict[str, float]:
-    """Measure against the result's own source, whose faces a baseline may have subdivided."""
-    from styleexp.experiments import metrics
+def _measuring(config: Config) -> Measure:
+    """A function that measures a result against its own source, whose faces a baseline may have
+    subdivided. What it measures of the style serves the run's next result, too."""
+    loaded: list[Judge | None] = []
+    banks: Banks = {}
 
-    device = result.subject.surface.vertices.device
-    judge = metrics.load_judge(_judge_name(config), config.metrics.windows, device)
-    source, style = result.subject.source, result.subject.style
-    return metrics.measure(
-        config, source, style, result.vertices, source.faces, judge, subject=result.subject
-    )
+    def measure(result: Result) -> dict[str, float]:
+        from styleexp.experiments import metrics
+
+        device = result.subject.surface.vertices.device
+        if not loaded:
+            name, windows = _judge_name(config), config.metrics.windows
+            loaded.append(metrics.load_judge(name, windows, device))
+        source, style = result.subject.source, result.subject.style
+        vertices, faces = result.vertices, source.faces
+        return metrics.measure(
+            config, source, style, vertices, faces, loaded[0], banks, subject=result.subject
+        )
+
+    return measure
 
 
 def _judge_name(config: Config) -> str | None:
