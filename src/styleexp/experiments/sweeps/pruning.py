@@ -63,8 +63,8 @@ class Trial:
         if not hopeless:
             return None
         return (
-            f"after step {step} its score was {best:.3g}, the median of {len(there)} finished "
-            f"trials {median(there):.3g}"
+            f"after step {step} its score was {best:.4g}, the median of {len(there)} finished "
+            f"trials {median(there):.4g}"
         )
 
     def _earlier(self) -> list[Path]:
