@@ -686,7 +686,7 @@ from joblib import Parallel, delayed
 from styleexp.experiments.sweeps import runner
 
 def job(number):
-    runner._end_with_runner()
+    runner.end_with_runner()
     print(os.getpid(), flush=True)
     time.sleep(0.2)
 
