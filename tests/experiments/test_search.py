@@ -137,10 +137,19 @@ def test_a_trial_is_judged_by_finished_trials_of_earlier_batches_alone(tmp_path,
     assert objective.objective(tmp_path / "7") == 3.0  # no better than the worst finished one
 
 
-@pytest.mark.parametrize("shares", ["0.5 1.5", "half", "0"])
-def test_shares_that_are_none_get_one_sentence(shares, tmp_path, searching, monkeypatch):
-    monkeypatch.setenv(pruning.AT, shares)
+@pytest.mark.parametrize(
+    ("shares", "after"), [("0.5 1.5", "5"), ("half", "5"), ("0", "5"), ("0.5", "0"), ("0.5", "x")]
+)
+def test_settings_that_are_none_get_one_sentence(shares, after):
     with pytest.raises(UserError, match="give shares of the steps between 0 and 1"):
-        pruning.trial(tmp_path / "0", 1)
-    monkeypatch.setenv(pruning.AT, "")
-    assert pruning.trial(tmp_path / "0", 1) is None
+        pruning.settings({pruning.AT: shares, pruning.AFTER: after})
+    assert pruning.settings({pruning.AT: "", pruning.AFTER: after}) is None
+    assert pruning.settings({pruning.AT: "0.2 0.5", pruning.AFTER: "3"}) == ((0.2, 0.5), 3)
+    assert pruning.settings({}) is None
+
+
+def test_a_search_refuses_such_settings_before_it_writes_anything(tmp_path):
+    done = search(tmp_path, "hydra.job.env_set.STYLEEXP_PRUNE_AT=2")
+    assert done.returncode == 2
+    assert done.stderr.startswith("styleexp: hydra.job.env_set.STYLEEXP_PRUNE_AT='2' with ")
+    assert list(tmp_path.iterdir()) == []

@@ -76,25 +76,34 @@ class Trial:
 def trial(folder: Path, batch: int) -> Trial | None:
     """The trial in that folder, of a search that starts ``batch`` trials together; None if it
     doesn't prune. Raises `UserError` for settings that can't be used."""
-    given, after = os.environ.get(AT, ""), os.environ.get(AFTER, "1")
+    found = settings(os.environ)
+    if found is None:
+        return None
+    if not folder.name.isdecimal():
+        raise UserError(
+            f"a search can't prune trials in folders named as '{folder.name}': drop "
+            f"hydra.sweep.subdir, or give hydra.job.env_set.{AT}= to prune none."
+        )
+    return Trial(folder, batch, *found)
+
+
+def settings(variables: Mapping[str, str]) -> tuple[tuple[float, ...], int] | None:
+    """The shares of the steps, and the number of trials, that these variables give; None if no
+    trial is to be pruned. Raises `UserError` for values that can't be used."""
+    given, after = variables.get(AT, ""), variables.get(AFTER, "1")
     if not given.strip():
         return None
     try:
         shares = tuple(float(each) for each in given.split())
         least = int(after)
     except ValueError:
-        shares, least = (), 0
-    if not shares or not all(0 < share < 1 for share in shares) or least < 1:
+        shares, least = (0.0,), 0
+    if not all(0 < share < 1 for share in shares) or least < 1:
         raise UserError(
             f"hydra.job.env_set.{AT}='{given}' with {AFTER}='{after}' is not possible: give shares "
             "of the steps between 0 and 1, as '0.33 0.67', and a number of trials from 1."
         )
-    if not folder.name.isdecimal():
-        raise UserError(
-            f"a search can't prune trials in folders named as '{folder.name}': drop "
-            f"hydra.sweep.subdir, or give hydra.job.env_set.{AT}= to prune none."
-        )
-    return Trial(folder, batch, shares, least)
+    return shares, least
 
 
 def _scores(notes: Mapping[str, Any]) -> dict[int, float]:
