@@ -95,6 +95,19 @@ def test_tables_beside_the_page(sweep):
     assert text.count("{") == text.count("}")
 
 
+@pytest.mark.parametrize(
+    ("printed", "best", "bold"),
+    [
+        ({"a": r"0.994 \pm 0.011", "b": r"0.996 \pm 0.014", "c": r"0.996 \pm 0.012"}, "b", "bc"),
+        ({"a": r"0.5 \pm 0.1", "b": r"0.6 \pm 0.1"}, "b", "b"),
+        ({"a": r"0.6 \pm 0.1", "b": r"0.6 \pm 0.2"}, "b", ""),
+        ({"a": "0.6", "b": r"0.6 \pm 0.2", "c": "0.7"}, "", ""),
+    ],
+)
+def test_means_that_are_printed_alike_are_bold_together(printed, best, bold):
+    assert comparison._alike(printed, set(best)) == set(bold)
+
+
 def test_a_chart_leaves_failed_runs_out(sweep):
     runs = sweep_page.finding.find(sweep)
     charts = sweep_page.plots(sweep_page.split(sweep, runs)[0])

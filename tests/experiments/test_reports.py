@@ -257,6 +257,15 @@ def test_heat_map_tells_most_vertices_apart_though_one_sticks_out():
     assert 0.09 < shows.reach < 0.11
 
 
+def test_numbers_below_a_chart_leave_room_for_each_other():
+    few, many = ["1", "5", "10"], [f"0.00{k}" for k in range(100, 114)]
+    assert charts._thinned(few) == few
+    assert charts._thinned([*few, "auto"]) == [*few, "auto"]  # names are all shown
+    shown = charts._thinned(many)
+    assert len(shown) == len(many)
+    assert [each for each in shown if each] == many[::3]
+
+
 def test_charts_leave_out_what_is_not_finite_and_escape_labels():
     nan = float("nan")
     chart = charts.line_chart("loss", "step", [(EVIL, [1, 2, 3], [1.0, nan, 3.0])])

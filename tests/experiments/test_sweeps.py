@@ -504,6 +504,29 @@ def test_a_task_of_slurm_needs_more_time_than_its_warning(monkeypatch):
         check(4)
 
 
+def test_more_tasks_than_slurm_takes_in_an_array_are_several_arrays(tmp_path, monkeypatch):
+    from types import SimpleNamespace as Given
+
+    for name in ("sbatch", "sacct"):
+        (tmp_path / name).write_text("#!/bin/sh\n")
+    (tmp_path / "scontrol").write_text(
+        '#!/bin/sh\ntest "$*" = "show config" && echo "MaxArraySize            = 1001"\n'
+    )
+    for name in ("sbatch", "sacct", "scontrol"):
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", os.pathsep.join([str(tmp_path), os.environ["PATH"]]))
+    slurm = Given(launcher=Given(_target_="SlurmLauncher"))
+    assert launchers.batch_size(slurm) == 1001
+    assert launchers.notes(slurm, 1001, 1) == []
+    (told,) = launchers.notes(slurm, 2003, 2)
+    assert "at most 1001 tasks in an array" in told
+    assert "there are 3 arrays" in told
+    assert told.endswith("give --per-task 5.")
+    assert -(-2 * 2003 // 5) <= 1001
+    (tmp_path / "scontrol").write_text("#!/bin/sh\nexit 1\n")  # no answer: no limit is known
+    assert launchers.batch_size(slurm) is None
+
+
 def slurm_lines(folder, *arguments):
     """The options in the batch file that ``--check`` shows; SLURM's commands may be missing."""
     done = sweep(
@@ -663,7 +686,7 @@ from joblib import Parallel, delayed
 from styleexp.experiments.sweeps import runner
 
 def job(number):
-    runner._end_with_runner()
+    runner.end_with_runner()
     print(os.getpid(), flush=True)
     time.sleep(0.2)
 

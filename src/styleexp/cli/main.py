@@ -141,7 +141,7 @@ def _job(config: DictConfig) -> float | None:
 
     from styleexp.config import compose, unread
     from styleexp.experiments.execute import run
-    from styleexp.experiments.sweeps import launchers, objective
+    from styleexp.experiments.sweeps import launchers, objective, pruning, runner
     from styleexp.system.errors import UserError
 
     runtime = HydraConfig.get()
@@ -156,12 +156,18 @@ def _job(config: DictConfig) -> float | None:
         if in_sweep:
             launchers.place(runtime, typed.device)
         folder = Path(runtime.runtime.output_dir)
+        trial = None
+        if in_search and numbered:
+            trial = pruning.trial(folder, runtime.sweeper.n_jobs)
         # Keep Hydra's grammar: resolving would lose an escaped "${" in a file's name.
         given: Any = OmegaConf.to_container(runtime.overrides.task, resolve=False)
         if not numbered and (note := unread.note([typed], given)):  # for sweeps, see `sweeps.claim`
             print(f"note: {note}")
-        with chdir(runtime.runtime.cwd):  # resolve typed paths despite hydra.job.chdir
-            code = run(typed, folder, given, again=not numbered)
+        if numbered:
+            runner.end_with_runner()
+        # Resolve typed paths despite hydra.job.chdir.
+        with runner.AT_WORK, chdir(runtime.runtime.cwd):
+            code = run(typed, folder, given, again=not numbered, trial=trial)
     except UserError as error:
         if config.debug or in_search:
             raise

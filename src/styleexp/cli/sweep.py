@@ -118,7 +118,8 @@ def _run(options: argparse.Namespace) -> int:
     if launchers.name_of(hydra) != "basic" and not options.no_check:
         launchers.check(hydra)
         _refuse_missing(jobs)
-    if told := launchers.note(hydra):
+    tasks = -(-len(_unfinished(jobs)) // options.per_task)
+    for told in launchers.notes(hydra, tasks, options.per_task):
         print(f"note: {told}", flush=True)
     try:
         manifest.write(folder, jobs)
@@ -200,7 +201,7 @@ def _check(
         print(f"launcher {name}: {tasks} tasks{of_each}, {at_once or 'all'} at a time")
         for line in launchers.described(hydra, tasks):
             print(line)
-        if told := launchers.note(hydra):
+        for told in launchers.notes(hydra, tasks, per_task):
             print(f"note: {told}")
     problems = preflight.missing(left)
     try:

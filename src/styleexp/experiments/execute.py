@@ -24,11 +24,15 @@ from styleexp.system.errors import UserError
 from styleexp.system.progress import announced, doing
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from styleexp.config.schema import Config
+    from styleexp.experiments.metrics import Banks, Judge
+    from styleexp.experiments.sweeps.pruning import Trial
     from styleexp.method.base import Method, Result, Scene, State, Step
     from styleexp.plugins.loggers import Loggers
+
+    Measure = Callable[[Result], dict[str, float]]
 
 SHOWN_METRICS = ("style_distance", "silhouette_iou", "flipped_faces")
 """Metrics printed at the end of a run."""
@@ -45,9 +49,10 @@ def run(
     overrides: list[str],
     again: bool = True,
     command: list[str] | None = None,
+    trial: Trial | None = None,
 ) -> int:
     """Stylise and write everything into ``folder``; return the exit code. ``command`` is recorded;
-    by default it is ``styleexp`` with the overrides.
+    by default it is ``styleexp`` with the overrides. A ``trial`` ends early where it is hopeless.
 
     Without ``again``, as in a sweep, a finished run isn't repeated, and a different run in the
     folder is an error instead of being replaced, unless it failed, or differs only in the code of
@@ -57,8 +62,8 @@ def run(
         if not again:
             job = Job(folder.name, tuple(overrides), folder, identity.job_key(config))
             found = reading.of_job(job)
-            if found.status == "done":
-                print(f"already done: {folder}")
+            if found.status in ("done", "pruned"):
+                print(f"already {found.status}: {folder}")
                 return 0
             if found.status == "other" and found.last_status != "failed":
                 edited = identity.edited_since(config, overrides, reading.read(folder).record)
@@ -69,11 +74,15 @@ def run(
                     )
                 told = " and ".join(edited)
                 print(f"note: the run in '{folder}' was of other code of {told}: running it again")
-        return begin(config, folder, overrides, command)
+        return begin(config, folder, overrides, command, trial)
 
 
 def begin(
-    config: Config, folder: Path, overrides: list[str], command: list[str] | None = None
+    config: Config,
+    folder: Path,
+    overrides: list[str],
+    command: list[str] | None = None,
+    trial: Trial | None = None,
 ) -> int:
     """Stylise into a folder whose lock is held; return the exit code.
 
@@ -89,7 +98,8 @@ def begin(
             f"note: replacing the unfinished run in '{folder}', which had other settings, files or "
             "another version"
         )
-    return _guarded(config, run_folder, unfinished or record, resumed=unfinished is not None)
+    resumed = unfinished is not None
+    return _guarded(config, run_folder, unfinished or record, resumed, trial)
 
 
 def resume(folder: Path) -> int:
@@ -120,7 +130,11 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 def _guarded(
-    config: Config, folder: records.RunFolder, record: dict[str, Any], resumed: bool
+    config: Config,
+    folder: records.RunFolder,
+    record: dict[str, Any],
+    resumed: bool,
+    trial: Trial | None = None,
 ) -> int:
     """Execute the run, and write its final status in any case; return the exit code."""
     if resumed:
@@ -136,7 +150,7 @@ def _guarded(
         if not replaces:
             folder.begin(None if resumed else record)
         with announced():
-            return _execute(config, folder, record, resumed, look)
+            return _execute(config, folder, record, resumed, look, trial)
     except BrokenPipeError:  # as with `styleexp ... | head`; not the folder's fault
         folder.write_status("interrupted", reason="the output pipe was closed")
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -174,6 +188,7 @@ def _execute(
     record: dict[str, Any],
     resumed: bool,
     look: live.Live,
+    trial: Trial | None,
 ) -> int:
     """Prepare, optimise, write and measure; return the exit code."""
     from styleexp.config import build
@@ -195,14 +210,19 @@ def _execute(
     record |= _determined(scene, config, assets)
     folder.write_json("run.json", record)
 
+    measure = _measuring(config)
     step = state.step if state else 0
     with Loggers(config, folder.path, record, step) as loggers:
-        if state is not None and not _optimise(method, scene, state, config, folder, loggers, look):
-            return INTERRUPTED
+        if state is not None:
+            code = _optimise(
+                method, scene, state, config, folder, loggers, look, trial, measure, started
+            )
+            if code is not None:
+                return code
         result = method.finish(scene, state)
         look.result(result)
         step = state.step if state else 0
-        written, measured = _write_results(result, config, folder)
+        written, measured = _write_results(result, config, folder, measure)
         seconds = time.perf_counter() - started
         if config.report:  # last, because it shows the other files
             from styleexp.experiments.reports import page
@@ -296,8 +316,12 @@ def _optimise(
     folder: records.RunFolder,
     loggers: Loggers,
     look: live.Live,
-) -> bool:
-    """Run the remaining steps; return False if the user stopped them."""
+    trial: Trial | None,
+    measure: Measure,
+    started: float,
+) -> int | None:
+    """Run the remaining steps; return the exit code if they end early: stopped by the user, or a
+    hopeless trial."""
     optim = config.optim
     blank = 0
     with endings.interruptible() as interrupted:
@@ -307,13 +331,27 @@ def _optimise(
             loggers.step(step)
             look.step(step, optim.steps, lambda: method.finish(scene, state))
             blank += getattr(step, "blank_views", 0)
+            # Before this step's checkpoint: a trial that goes on from it has been judged.
+            if trial and trial.due(state.step, optim.steps):
+                doing("measuring the trial")
+                result = method.finish(scene, state)
+                reason = trial.verdict(state.step, measure(result))
+                doing("")
+                if reason is not None:
+                    look.result(result)
+                    seconds = round(time.perf_counter() - started, 1)
+                    folder.write_status("pruned", step=state.step, reason=reason, seconds=seconds)
+                    folder.save_checkpoint(state)
+                    loggers.ended = "interrupted"
+                    print(f"pruned: {reason}")
+                    return 0
             if state.step % optim.checkpoint_every == 0 or interrupted:
                 folder.save_checkpoint(state)
             if interrupted and state.step < optim.steps:
                 folder.write_status("interrupted", step=state.step)
                 loggers.ended = "interrupted"
                 print(f"\nstopped at step {state.step}; continue with: {_resuming(folder)}")
-                return False
+                return INTERRUPTED
     if folder.checkpoint_step() != state.step:
         folder.save_checkpoint(state)
     if blank:
@@ -321,7 +359,7 @@ def _optimise(
         print(
             f"note: {blank} views did not show the mesh and {what} (blank_views in metrics.jsonl)"
         )
-    return True
+    return None
 
 
 def _explained(steps: Iterator[Step], folder: records.RunFolder) -> Iterator[Step]:
@@ -342,7 +380,7 @@ def _explained(steps: Iterator[Step], folder: records.RunFolder) -> Iterator[Ste
 
 
 def _write_results(
-    result: Result, config: Config, folder: records.RunFolder
+    result: Result, config: Config, folder: records.RunFolder, measure: Measure
 ) -> tuple[list[Path], dict[str, float]]:
     """Write, draw and measure the result; return the files to name to the user, and the metrics."""
     from styleexp import plugins
@@ -357,7 +395,7 @@ def _write_results(
     names = ("preview.png", "turntable.gif", *meshes)
     written = [folder.path / name for name in names]
     doing("measuring the result")
-    measured = _measure(result, config)
+    measured = measure(result)
     doing("")
     folder.write_json("metrics.json", measured)
     shown = [name for name in SHOWN_METRICS if name in measured]
@@ -370,16 +408,26 @@ def _write_results(
     return written, measured
 
 
-def _measure(result: Result, config: Config) -> dict[str, float]:
-    """Measure against the result's own source, whose faces a baseline may have subdivided."""
-    from styleexp.experiments import metrics
+def _measuring(config: Config) -> Measure:
+    """A function that measures a result against its own source, whose faces a baseline may have
+    subdivided. What it measures of the style serves the run's next result, too."""
+    loaded: list[Judge | None] = []
+    banks: Banks = {}
 
-    device = result.subject.surface.vertices.device
-    judge = metrics.load_judge(_judge_name(config), config.metrics.windows, device)
-    source, style = result.subject.source, result.subject.style
-    return metrics.measure(
-        config, source, style, result.vertices, source.faces, judge, subject=result.subject
-    )
+    def measure(result: Result) -> dict[str, float]:
+        from styleexp.experiments import metrics
+
+        device = result.subject.surface.vertices.device
+        if not loaded:
+            name, windows = _judge_name(config), config.metrics.windows
+            loaded.append(metrics.load_judge(name, windows, device))
+        source, style = result.subject.source, result.subject.style
+        vertices, faces = result.vertices, source.faces
+        return metrics.measure(
+            config, source, style, vertices, faces, loaded[0], banks, subject=result.subject
+        )
+
+    return measure
 
 
 def _judge_name(config: Config) -> str | None:

@@ -36,14 +36,14 @@ class Run:
 
     folder: Path
     status: str = "missing"
-    """``done``, ``running``, ``interrupted`` or ``failed``, as the run wrote it; or ``missing`` if
-    it never started, ``died`` if it is said to be running but has no process, ``unreadable`` if
-    its files don't tell, ``newer`` if a later version of styleexp wrote it, ``other`` if a job's
-    folder holds another run."""
+    """``done``, ``running``, ``interrupted``, ``failed`` or, of a search's trial that was hopeless,
+    ``pruned``, as the run wrote it; or ``missing`` if it never started, ``died`` if it is said to
+    be running but has no process, ``unreadable`` if its files don't tell, ``newer`` if a later
+    version of styleexp wrote it, ``other`` if a job's folder holds another run."""
     reason: str | None = None
     """Why the run has this status, if known."""
     seconds: float | None = None
-    """Wall time of a finished run."""
+    """Wall time of a finished or pruned run."""
     record: dict[str, Any] = field(default_factory=dict)
     """``run.json``; empty if there is none that can be used."""
     overrides: list[str] = field(default_factory=list)

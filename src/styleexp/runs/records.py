@@ -45,6 +45,7 @@ FILES = (
     "check.gif",
     "check.json",
     "metrics.json",
+    "trial.json",
     "report.html",
     "mlflow.json",
     "run.json",
@@ -90,7 +91,8 @@ class RunFolder:
         return self.path / "metrics.jsonl"
 
     def write_status(self, status: str, **more: Any) -> None:
-        """Write ``status.json``: "running", "done", "interrupted" or "failed", with the reason."""
+        """Write ``status.json``: "running", "done", "interrupted", "pruned" or
+        "failed", with the reason."""
         self.write_json("status.json", {"schema": SCHEMA, "status": status, "time": now(), **more})
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:

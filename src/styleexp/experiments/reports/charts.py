@@ -11,6 +11,8 @@ from markupsafe import Markup, escape
 WIDTH, HEIGHT = 420, 210
 LEFT, RIGHT, TOP, BOTTOM = 58, 12, 12, 34
 """Margins, in the chart's units (about pixels)."""
+DIGIT = 8
+"""Width of a label's character with the space between labels, in these units."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ def dot_chart(
         return Markup("")
     right = Scale(-0.5, len(kept) - 0.5, LEFT, WIDTH - RIGHT)
     up = _scale(values, HEIGHT - BOTTOM, TOP)
-    labels = [label for label, _ in kept]
+    labels = _thinned([label for label, _ in kept])
     parts = [_axes(right, up, across, list(range(len(kept))), labels)]
     means = [(k, sum(y for _, y in d) / len(d)) for k, (_, d) in enumerate(kept) if d]
     path = " ".join(f"{right(k):.1f},{up(y):.1f}" for k, y in means)
@@ -72,6 +74,16 @@ def dot_chart(
             label = f"{run}: {y:.4g}"
             parts.append(f'<circle class="dot" {place}><title>{escape(label)}</title></circle>')
     return _chart(title, parts, [])
+
+
+def _thinned(labels: Sequence[str]) -> list[str]:
+    """Labels of an axis, those empty for which numbers leave no room, as a search's values."""
+    try:
+        longest = max(len(f"{float(label):g}") for label in labels)
+    except ValueError:
+        return list(labels)
+    every = math.ceil(DIGIT * longest * len(labels) / (WIDTH - LEFT - RIGHT))
+    return [label if k % every == 0 else "" for k, label in enumerate(labels)]
 
 
 def _chart(title: str, parts: list[str], legend: list[tuple[int, str]]) -> Markup:

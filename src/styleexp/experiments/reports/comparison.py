@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -192,8 +192,9 @@ def write_csv(comparison: Comparison, path: Path) -> None:
 
 
 def latex(comparison: Comparison) -> str:
-    """A table for booktabs: a row per value, the best mean of each measure in bold. Measures with
-    the same mean in all of several rows are only named in a comment."""
+    """A table for booktabs: a row per value, the best mean of each measure in bold, with those that
+    are printed alike. Measures with the same mean in all of several rows are only named in a
+    comment."""
     arrows = {1: r"$\uparrow$", -1: r"$\downarrow$"}
     head = [escaped(comparison.key), "$n$"]
     shown = [name for name in comparison.measures if not _is_same(comparison, name)]
@@ -203,6 +204,15 @@ def latex(comparison: Comparison) -> str:
         lines.append(f"% The same in all rows: {', '.join(same)}.")
     lines += [rf"\begin{{tabular}}{{@{{}}lr{'r' * len(shown)}@{{}}}}", r"\toprule"]
     lines += [" & ".join(head) + r" \\", r"\midrule"]
+    printed = {
+        name: {
+            row.value: _cell(row.means[name].mean, row.means[name].reach)
+            for row in comparison.rows
+            if name in row.means
+        }
+        for name in shown
+    }
+    bold = {name: _alike(printed[name], comparison.best(name)) for name in shown}
     for row in comparison.rows:
         total = row.done + row.unfinished
         cells = [
@@ -210,12 +220,18 @@ def latex(comparison: Comparison) -> str:
             str(row.done) if row.done == total else f"{row.done} of {total}",
         ]
         for name in shown:
-            mean = row.means.get(name)
-            cell = "--" if mean is None else _cell(mean.mean, mean.reach)
-            best = row.value in comparison.best(name)
-            cells.append(rf"$\mathbf{{{cell}}}$" if best else f"${cell}$" if mean else cell)
+            cell = printed[name].get(row.value)
+            text = rf"\mathbf{{{cell}}}" if row.value in bold[name] else cell
+            cells.append("--" if cell is None else f"${text}$")
         lines.append(" & ".join(cells) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
+
+
+def _alike(printed: Mapping[str, str], best: set[str]) -> set[str]:
+    """The values whose means are printed as one of the best; none if all are."""
+    means = {value: cell.partition(r" \pm")[0] for value, cell in printed.items()}
+    found = {value for value, mean in means.items() if mean in {means[each] for each in best}}
+    return found if len(found) < len(means) else set()
 
 
 def _is_same(comparison: Comparison, measure: str) -> bool:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from styleexp.config import unread
 from styleexp.config.overrides import quote
+from styleexp.experiments.sweeps import pruning
 from styleexp.experiments.sweeps.settings import product
 from styleexp.runs import identity, reading
 from styleexp.runs.jobs import JOBS, Job, listed
@@ -45,8 +46,10 @@ def run(config: DictConfig) -> None:
 def sweep(config: DictConfig) -> Path:
     """Claim the folder of a sweep, record its jobs in ``jobs.json``, and return the folder.
 
-    Raises `UserError` like `run`, and if the folder contains results of other jobs.
+    Raises `UserError` like `run`, if the folder contains results of other jobs, and for a search
+    whose settings for pruning can't be used.
     """
+    pruning.settings(config.hydra.job.env_set)
     folder = _claim(config, "sweep")
     try:
         configs: dict[str, Config] = {}

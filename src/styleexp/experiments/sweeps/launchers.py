@@ -125,7 +125,8 @@ def described(hydra: Any, tasks: int) -> list[str]:
     """
     kind = name_of(hydra)
     if kind == "submitit_slurm":
-        return ["the batch file for SLURM:", *(f"  {line}" for line in _batch_file(hydra, tasks))]
+        size = min(tasks, batch_size(hydra) or tasks)
+        return ["the batch file for SLURM:", *(f"  {line}" for line in _batch_file(hydra, size))]
     if kind == "submitit_local":
         return [f"each task in a process of its own, for at most {hydra.launcher.timeout_min} min"]
     return []
@@ -151,21 +152,34 @@ def check(hydra: Any) -> None:
         )
 
 
-def note(hydra: Any) -> str | None:
-    """A sentence on what doesn't work as it should with the launcher here; None if all does."""
+def notes(hydra: Any, tasks: int, per_task: int) -> list[str]:
+    """Sentences on what doesn't work as one might expect with the launcher here, for that many
+    tasks of ``per_task`` jobs."""
     if name_of(hydra) != "submitit_slurm" or shutil.which("sbatch") is None:
-        return None
+        return []
+    found = []
+    most = batch_size(hydra)
+    if most is not None and tasks > most:
+        found.append(
+            f"SLURM takes at most {most} tasks in an array here (MaxArraySize), so there are "
+            f"{math.ceil(tasks / most)} arrays, each after the other has ended: for a single one, "
+            f"give --per-task {math.ceil(tasks * per_task / most)}."
+        )
+    if _answer("sacct", "--noheader", "--jobs=1") is None:
+        found.append(
+            "SLURM's accounting (sacct) doesn't answer here, so a task that is killed is not "
+            "noticed: if nothing runs any more, end this command and repeat it."
+        )
+    return found
+
+
+def _answer(*command: str) -> str | None:
+    """What a command of SLURM's prints; None if it is missing, fails, or doesn't answer."""
     try:
-        done = subprocess.run(["sacct", "--noheader", "--jobs=1"], capture_output=True, timeout=20)
-        answers = done.returncode == 0
+        done = subprocess.run(command, capture_output=True, text=True, timeout=20)
     except (OSError, subprocess.TimeoutExpired):
-        answers = False
-    if answers:
         return None
-    return (
-        "SLURM's accounting (sacct) doesn't answer here, so a task that is killed is not "
-        "noticed: if nothing runs any more, end this command and repeat it."
-    )
+    return done.stdout if done.returncode == 0 else None
 
 
 def _batch_file(hydra: Any, tasks: int) -> list[str]:
@@ -190,8 +204,14 @@ def _batch_file(hydra: Any, tasks: int) -> list[str]:
 
 
 def batch_size(hydra: Any) -> int | None:
-    """Maximum number of jobs per batch for the launcher; None for no limit."""
+    """Maximum number of tasks per batch for the launcher; None for no limit. SLURM's limits the
+    tasks of an array."""
     kind = name_of(hydra)
+    if kind == "submitit_slurm":
+        found = re.search(
+            r"^MaxArraySize\s*=\s*(\d+)", _answer("scontrol", "show", "config") or "", re.M
+        )
+        return max(1, int(found[1])) if found else None
     if kind == "submitit_local":
         return side_by_side(hydra)
     return MANY if kind in ("basic", "joblib") else None

@@ -55,9 +55,10 @@ def _claimed(claim_: Callable[[DictConfig], T], config: DictConfig) -> T | None:
 
 
 def exit_code(folder: Path) -> int:
-    """0 if every job of the sweep is done, else 2; based on the jobs' own status."""
+    """0 if every job of the sweep is done, or pruned by its search, else 2; based on the jobs' own
+    status."""
     states = {reading.of_job(job).status for job in planned(folder)}
-    return 0 if states == {"done"} else 2
+    return 0 if states and states <= {"done", "pruned"} else 2
 
 
 def finish(folder: Path, name: str | None = None) -> None:
@@ -135,7 +136,7 @@ def show(rows: Sequence[dict[str, Any]], title: str) -> None:
         shown.add_row(
             str(row["job"]),
             readable(overrides),
-            status if status == "done" else f"[red]{status}[/red]",
+            status if status in ("done", "pruned") else f"[red]{status}[/red]",
             _number(row.get("style_distance")),
             _number(row["loss"]),
             f"{seconds:.0f} s" if isinstance(seconds, int | float) else "",

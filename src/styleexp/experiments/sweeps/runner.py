@@ -236,7 +236,7 @@ def _attempt(job: Job, root: Path, composed: Callable[[], Config]) -> None:
 
     from hydra.core.hydra_config import HydraConfig
 
-    _end_with_runner()
+    end_with_runner()
     try:
         with AT_WORK, locks.hold(job.folder), chdir(HydraConfig.get().runtime.cwd):
             if (root / CANCELLED).exists():
@@ -249,8 +249,9 @@ def _attempt(job: Job, root: Path, composed: Callable[[], Config]) -> None:
 
 
 @cache
-def _end_with_runner() -> None:
-    """Exit a joblib worker after its job if its runner was killed; it would wait forever."""
+def end_with_runner() -> None:
+    """Exit a joblib worker after its job if the process that started it, a plan's or a sweep's, was
+    killed; it would wait forever."""
     if not multiprocessing.current_process().name.startswith("Loky"):
         return
     runner = os.getppid()
