@@ -10,7 +10,7 @@ import numpy as np
 from styleexp.inputs.meshes.mesh import Carrier
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import Float, Int
 
 FLAT = 0.985
 """Cosine between two faces' normals above which the edge between them may be flipped."""
@@ -30,16 +30,13 @@ def flipped(vertices: Float[np.ndarray, "vertices 3"], carrier: Carrier, longest
     """
     same = groups(carrier)
     faces = np.where(carrier.flipped[:, None], carrier.corners[:, ::-1], carrier.corners)
-    changed = np.ones(len(faces), bool)
     for _ in range(ROUNDS):
-        flips = _flips(vertices, carrier.rows, faces, same, changed, longest)
+        flips = _flips(vertices, carrier.rows, faces, same, longest)
         if not len(flips):
             break
         first, second, a, b, c, d = flips.T
         faces[first] = np.stack([a, d, c], axis=1)
         faces[second] = np.stack([d, b, c], axis=1)
-        changed[:] = False
-        changed[first] = changed[second] = True
     corners = np.where(carrier.flipped[:, None], faces[:, ::-1], faces)
     return replace(carrier, corners=corners)
 
@@ -49,26 +46,29 @@ def _flips(
     rows: Int[np.ndarray, " rows"],
     faces: Int[np.ndarray, "faces 3"],
     same: Int[np.ndarray, " faces"],
-    changed: Bool[np.ndarray, " faces"],
     longest: float,
 ) -> Int[np.ndarray, "flips 6"]:
-    """Edges of ``changed`` faces to flip, no two of one face: their two faces, their two ends, and
-    the two opposite corners; as rows."""
+    """Edges to flip, no two of one face: their two faces, their two ends, and the two opposite
+    corners; as rows."""
     start, end, opposite = (np.roll(faces, -k, axis=1).ravel() for k in range(3))
-    of = np.repeat(np.arange(len(faces)), 3)
+    # Two angles that sum to more than pi: one of them is obtuse.
+    obtuse = _obtuse(vertices, rows[faces])
+    if not len(obtuse):
+        return np.empty((0, 6), np.int64)
     key = start * len(rows) + end
     order = np.argsort(key)
     ordered = key[order]
+    twin = end[obtuse] * len(rows) + start[obtuse]
+    place = np.searchsorted(ordered, twin)
+    its = order[place.clip(max=len(order) - 1)]
     # Twice the same directed edge is not manifold.
-    again = np.zeros(len(key), bool)
-    again[order[1:]] = ordered[1:] == ordered[:-1]
-    again[order[:-1]] |= again[order[1:]]
-    mine = np.flatnonzero(changed[of] & ~again)
-    twin = end[mine] * len(rows) + start[mine]
-    its = order[np.searchsorted(ordered, twin).clip(max=len(order) - 1)]
-    fits = (key[its] == twin) & ~again[its] & (same[of[mine]] == same[of[its]])
-    fits &= (start[mine] < end[mine]) | ~changed[of[its]]  # each edge once
-    mine, its = mine[fits], its[fits]
+    single = np.searchsorted(ordered, twin, "right") - place == 1
+    own = key[obtuse]
+    single &= np.searchsorted(ordered, own, "right") - np.searchsorted(ordered, own) == 1
+    of, other = obtuse // 3, its // 3
+    single &= same[of] == same[other]
+    single &= (own < twin) | ~np.isin(its, obtuse)  # each edge once
+    mine, its = obtuse[single], its[single]
     a, b, c, d = start[mine], end[mine], opposite[mine], opposite[its]
     worth = _gain(*(vertices[rows[each]] for each in (a, b, c, d)))
     before, after = (
@@ -76,7 +76,7 @@ def _flips(
         for one, other in ((a, b), (c, d))
     )
     worth = np.where(after > np.maximum(before, longest), 0.0, worth)
-    flips = np.stack([of[mine], of[its], a, b, c, d], axis=1)[np.argsort(-worth)]
+    flips = np.stack([mine // 3, its // 3, a, b, c, d], axis=1)[np.argsort(-worth)]
     flips = flips[: np.count_nonzero(worth)]
     if not len(flips):
         return flips
@@ -87,6 +87,16 @@ def _flips(
     new = pair.min(axis=1) * len(vertices) + pair.max(axis=1)
     there = known[np.searchsorted(known, new).clip(max=len(known) - 1)] == new
     return _apart(flips[~there], new[~there], len(faces))
+
+
+def _obtuse(
+    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Int[np.ndarray, " edges"]:
+    """The half-edges opposite obtuse angles: three times the face, plus the corner they start
+    at."""
+    corners = vertices[faces]
+    square = ((corners - np.roll(corners, -1, axis=1)) ** 2).sum(axis=2)
+    return np.flatnonzero((2 * square > square.sum(axis=1, keepdims=True)).ravel())
 
 
 def _apart(
