@@ -82,8 +82,11 @@ def test_texture_coordinates_colours_parts_and_seams_are_carried_over(tmp_path):
 def test_what_only_the_files_own_format_holds_is_named(tmp_path):
     ball = trimesh.creation.icosphere(1)
     ball.export(tmp_path / "ball.glb")
-    fine = meshes.refine(meshes.load_mesh(tmp_path / "ball.glb"), 0.2)
-    assert "glTF" in fine.repairs[-1]
+    mesh = meshes.load_mesh(tmp_path / "ball.glb")
+    assert meshes.refine(mesh, 0.2).repairs[-1].endswith(" faces")
+    mesh.carrier.document.tree.update(skins=[{}], cameras=[{}], materials=[{"normalTexture": {}}])
+    fine = meshes.refine(mesh, 0.2)
+    assert fine.repairs[-1].endswith("without skins, cameras and normal maps")
     ball.face_attributes["quality"] = np.arange(len(ball.faces), dtype=np.float32)
     ball.export(tmp_path / "ball.ply")
     fine = meshes.refine(meshes.load_mesh(tmp_path / "ball.ply"), 0.2)

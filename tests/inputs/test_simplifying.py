@@ -121,3 +121,8 @@ def test_a_run_writes_it_beside_its_result(tmp_path, capsys):
     assert f"to {len(small.faces):,} faces" in capsys.readouterr().out
     whole = {tuple(each) for each in result.vertices.astype(np.float32)}
     assert {tuple(each) for each in small.vertices.astype(np.float32)} < whole
+
+
+def test_a_flap_is_taken_off_so_that_the_surface_is_closed():
+    faces = np.array([[0, 1, 2], [3, 4, 5], [2, 1, 0], [0, 1, 3]])
+    assert simplifying._doubled(faces).tolist() == [True, False, True, False]

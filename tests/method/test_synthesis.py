@@ -13,6 +13,7 @@ from styleexp.config.compose import compose
 from styleexp.inputs import meshes, shapes, spheres
 from styleexp.method import scene
 from styleexp.method.patches import relief_of_mesh
+from styleexp.method.synthesis import method as synthesis
 from styleexp.method.synthesis.direction import FLOW, UP, direction_field, turned
 from styleexp.method.synthesis.exemplar import MeshExemplar, PictureExemplar, measure
 from styleexp.method.synthesis.optimise import bank, matched
@@ -284,3 +285,12 @@ def test_flatten_takes_the_sources_own_bumps_off_as_far_as_the_relief_is_high():
         UserError, match=r"baseline.flatten=2.0 is not allowed: give a value from 0 to 1\."
     ):
         styleexp.stylize(*given, "baseline.flatten=2")
+
+
+def test_a_direction_that_is_asked_for_is_followed_by_a_pattern_without_one():
+    """Blobs that are longer than wide, but of no measurable direction, lie as the user says."""
+    config = compose(["source=sphere", "style=bubble", "method=synthesis"])
+    assert synthesis.any_way(build.subject_of(config, True), directed=False)
+    assert not synthesis.any_way(build.subject_of(config, True), directed=True)
+    config = compose(["source=sphere", "style=bubble", "method=synthesis", "style.direction=up"])
+    assert not synthesis.any_way(build.subject_of(config, True), directed=False)

@@ -18,8 +18,8 @@ def test_the_thickness_is_that_of_a_wall():
     depth, places = prints.thickness(vertices, faces)
     side = np.abs(places[:, 2]) < 15
     assert np.median(depth[side]) == pytest.approx(2.0, abs=0.05)
-    closed, told = prints.notes(vertices, faces)
-    assert closed == "for printing: the result is watertight"
+    closed, told = prints.notes("the result", vertices, faces)
+    assert closed == "the result is watertight"
     assert "1 % of its surface is thinner than 2 units" in told or "than 1.9" in told
     # Another frame and unit, the same wall.
     moved, _ = prints.thickness(1000 * vertices + 5e4, faces)
@@ -43,4 +43,4 @@ def test_what_is_not_watertight_is_counted(fault, told):
         faces = np.concatenate([faces, [[*faces[0, :2], len(vertices) - 1]]])
     else:
         faces = np.concatenate([faces[:1, ::-1], faces[1:]])
-    assert told in prints._closed(faces)
+    assert told in prints._closed("it", faces)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 EVERY_RUN = (
     "source", "style", "baseline", "optim.seed", "preview", "metrics", "logger", "report",
-    "keep_checkpoint", "strength", "device", "threads", "debug",
+    "formats", "simplify", "keep_checkpoint", "strength", "device", "threads", "debug",
 )  # fmt: skip
 """Keys that every method reads."""
 FOR_RENDERS = ("style.image_contrast", "style.image_match_mean")

@@ -35,16 +35,26 @@ def write(result: Result, config: Config, folder: Path) -> list[str]:
     for name in names:
         doing(f"writing {name}")
         result.save(folder / name)
+    shown = {"the result": (result.vertices, result.faces)}
     if config.simplify is not None:
-        names += _simplified(result, config.simplify, kinds, folder)
+        more, vertices, faces = _simplified(result, config.simplify, kinds, folder)
+        names += more
+        shown["the simplified result"] = vertices, faces
     if config.formats:
         doing("looking at the result as a printer would")
-        for note in prints.notes(result.vertices, result.faces):
-            print(f"note: {note}")
+        for what, mesh in shown.items():
+            for note in prints.notes(what, *mesh):
+                print(f"note: for printing: {note}")
+        if "3mf" in config.formats:
+            size = " x ".join(f"{each:.3g}" for each in np.ptp(result.vertices, axis=0))
+            print(f"note: for printing: a unit of the 3MF is a millimetre, it is {size} mm")
     return names
 
 
-def _simplified(result: Result, faces: int, kinds: tuple[str, ...], folder: Path) -> list[str]:
+def _simplified(
+    result: Result, faces: int, kinds: tuple[str, ...], folder: Path
+) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """Write it; return the files' names, its vertices and its faces."""
     doing("simplifying the result")
     extent = float(np.ptp(np.quantile(result.displacement, RANGE)))
     small, kept, error = simplifying.simplified(
@@ -55,7 +65,7 @@ def _simplified(result: Result, faces: int, kinds: tuple[str, ...], folder: Path
     for name in names:
         doing(f"writing {name}")
         meshes.save_mesh(small, result.vertices[kept], folder / name, result.displacement[kept])
-    return names
+    return names, result.vertices[kept], small.faces
 
 
 def told(found: int, wanted: int, before: int, error: float, extent: float) -> str:

@@ -20,10 +20,10 @@ INSIDE = 1e-5
 
 
 def notes(
-    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+    what: str, vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
 ) -> list[str]:
-    """Sentences about a mesh that is to be printed; lengths in its own units."""
-    found = [_closed(faces)]
+    """Sentences about a mesh, ``what``, that is to be printed; lengths in its own units."""
+    found = [_closed(what, faces)]
     if find_spec("embreex") is None:
         return [
             *found,
@@ -64,7 +64,7 @@ def thickness(
     return reached * detail.extent, places[hit] * detail.extent + detail.middle
 
 
-def _closed(faces: Int[np.ndarray, "faces 3"]) -> str:
+def _closed(what: str, faces: Int[np.ndarray, "faces 3"]) -> str:
     """Whether every edge joins two faces, wound alike."""
     edges = np.concatenate([faces[:, [k, (k + 1) % 3]] for k in range(3)])
     key = np.sort(edges, axis=1)
@@ -76,11 +76,11 @@ def _closed(faces: Int[np.ndarray, "faces 3"]) -> str:
     open_, many = int((count == 1).sum()), int((count > 2).sum())
     against = int(((count == 2) & (one_way != 1)).sum())
     if not (open_ or many or against):
-        return "for printing: the result is watertight"
+        return f"{what} is watertight"
     faults = [
         (open_, "open edges"),
         (many, "edges of more than two faces"),
         (against, "edges whose two faces are wound against each other"),
     ]
     told = ", ".join(f"{what}: {number:,}" for number, what in faults if number)
-    return f"for printing: the result is not watertight, a slicer may have to repair it ({told})"
+    return f"{what} is not watertight, a slicer may have to repair it ({told})"

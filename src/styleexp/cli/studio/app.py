@@ -129,9 +129,16 @@ def _page() -> str:
         ["viewers.js", "studio.js"],
         viewer=html.viewer(),
         blocks={},
-        sources=list(shapes.SOURCES),
-        styles=list(shapes.STYLES),
+        sources=[*shapes.SOURCES, *_here("mesh")],
+        styles=[*shapes.STYLES, *_here("image")],
     )
+
+
+def _here(kind: str) -> list[str]:
+    """Names of meshes or pictures that are on this machine."""
+    from styleexp.inputs import assets
+
+    return [name for name in assets.names(kind) if assets.locate(name, kind) is not None]
 
 
 def serve(settings: Settings, folder: Path, port: int, opens: bool) -> int:

@@ -41,8 +41,13 @@ class Kept:
 
     def source(self, settings: Settings) -> tuple[meshes.Mesh, Style]:
         """The source and the style as read."""
-        config, _ = configured(settings.source, settings.style, [])
-        sources.check(config)
+
+        def named() -> Any:
+            config, _ = configured(settings.source, settings.style, [])
+            sources.check(config)
+            return config
+
+        config = self._get("named", (settings.source, settings.style), named)
         return (
             self._get("source", settings.source, lambda: sources.load_source(config.source)),
             self._get("style", settings.style, lambda: sources.load_style(config.style)),

@@ -65,6 +65,11 @@ class Settings:
         return Settings(**values)
 
     @property
+    def mask_without_strokes(self) -> str:
+        """The mask without the brush's strokes, which are places on one mesh."""
+        return " ".join(each for each in self.mask.split() if "near:" not in each)
+
+    @property
     def overrides(self) -> list[str]:
         """Overrides of everything but source and style that differs from a command's defaults."""
         plain = Settings()

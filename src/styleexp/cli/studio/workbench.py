@@ -106,6 +106,8 @@ class Workbench:
     def change(self, given: dict[str, Any]) -> None:
         """Take new settings; the result follows. Raises `UserError` for unfit ones."""
         with self._lock:
+            if given.get("source", self._settings.source) != self._settings.source:
+                given = {"mask": self._settings.mask_without_strokes, **given}
             self._settings = self._settings.changed(given)
             self._serial += 1
             self._learn, self._stop = False, True
@@ -318,6 +320,7 @@ class Workbench:
     @contextmanager
     def _at(self, serial: int, stage: str) -> Iterator[None]:
         self._check(serial)
+        progress.doing("")
         with self._lock:
             self._tell(stage)
         with process.undisturbed(0, self._settings.seed):
@@ -355,8 +358,11 @@ class Workbench:
     def _show(
         self, serial: int, result: Result, settings: Settings, finished: bool, learned: int = 0
     ) -> None:
-        frame = result.subject.frame
-        content = glb.glb(frame.apply(result.vertices), result.faces, _reach(result), bare=True)
+        # That of the source as it was, so that a draft, the result and the source don't jump.
+        assert self._inputs[0] is not None
+        frame = meshes.normalisation(self._inputs[0].vertices)
+        points = frame.apply(result.vertices)
+        content = glb.glb(points, result.faces, float(np.abs(points).max()), bare=True)
         with self._lock:
             self._check(serial)
             self._made = Made(result, settings, finished, learned)
@@ -401,7 +407,3 @@ def _png(style: Style) -> bytes:
     out = io.BytesIO()
     picture.save(out, "PNG")
     return out.getvalue()
-
-
-def _reach(result: Result) -> float:
-    return float(np.abs(result.subject.frame.apply(result.vertices)).max())

@@ -67,7 +67,7 @@ def refine(mesh: Mesh, longest: float) -> Mesh:
         carrier = flipped(vertices, carrier, longest)
     if len(carrier.corners) == before:
         return mesh
-    left_out = "skins, animations and other glTF data" if carrier.document else ""
+    left_out = _gltf_alone(carrier) if carrier.document else ""
     left_out = _ply_alone(carrier) if carrier.ply else left_out
     note = f"refined from {before:,} to {len(carrier.corners):,} faces"
     if left_out:
@@ -221,6 +221,30 @@ def _ply_alone(carrier: Carrier) -> str:
         f"face properties ({', '.join(carrier.ply.own_faces)})" if carrier.ply.own_faces else "",
     ]
     return " and ".join(filter(None, parts))
+
+
+def _gltf_alone(carrier: Carrier) -> str:
+    """Data of a glTF file that only its own document holds."""
+    tree = carrier.document.tree
+    materials = tree.get("materials", [])
+    primitives = [each for mesh in tree.get("meshes", []) for each in mesh.get("primitives", [])]
+    surfaces = [each.get("pbrMetallicRoughness", {}) for each in materials]
+    stored = {name for each in primitives for name in each["attributes"]}
+    found = {
+        "skins": tree.get("skins"),
+        "animations": tree.get("animations"),
+        "cameras": tree.get("cameras"),
+        "lights": "KHR_lights_punctual" in tree.get("extensions", {}),
+        "morph targets": any(each.get("targets") for each in primitives),
+        "further texture coordinates": "TEXCOORD_1" in stored,
+        "normal maps": any("normalTexture" in each for each in materials),
+        "occlusion maps": any("occlusionTexture" in each for each in materials),
+        "emission maps": any("emissiveTexture" in each for each in materials),
+        "roughness maps": any("metallicRoughnessTexture" in each for each in surfaces),
+        "extensions of materials": any(each.get("extensions") for each in materials),
+    }
+    *most, last = [name for name, there in found.items() if there] or [""]
+    return f"{', '.join(most)} and {last}" if most else last
 
 
 def _unit(normals: np.ndarray | None) -> np.ndarray | None:

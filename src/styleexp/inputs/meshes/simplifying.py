@@ -14,7 +14,7 @@ from styleexp.inputs.meshes.mesh import Carrier, Mesh
 from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Bool, Float, Int
 
 MISSING = "simplifying needs meshoptimizer: pip install 'styleexp[simplify]'."
 TEXTURE = 0.5
@@ -87,6 +87,7 @@ def simplified(
             **options | {"target_index_count": size(3 * faces)},
         )
     left = found[:count].reshape(-1, 3).astype(np.int64)
+    left = left[~_doubled(carrier.rows[row[left]])]
     like = first[left[:, 0]]
     left = np.where(carrier.flipped[like][:, None], left[:, ::-1], left)
     kept_rows, corners = np.unique(left, return_inverse=True)
@@ -99,6 +100,15 @@ def simplified(
         mesh.name, mesh.vertices[kept], np.ascontiguousarray(positions), mesh.repairs, small
     )
     return result, kept, float(moved_by[0]) * extent
+
+
+def _doubled(faces: Int[np.ndarray, "faces 3"]) -> Bool[np.ndarray, " faces"]:
+    """Faces of the same three vertices as another: the two sides of a flap, into which a collapse
+    may fold the surface. Without both the surface is closed again."""
+    _, of, count = np.unique(
+        np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    return count[of.ravel()] > 1
 
 
 def _apart(

@@ -123,7 +123,7 @@ def heights(
     tell(summary(subject, begun.pattern, begun.directed, levels))
     total = sum(level.rounds for level in levels)
     found = synthesise(
-        begun.sheet, ahead, begun.exemplar, levels, subject.unit, not begun.directed,
+        begun.sheet, ahead, begun.exemplar, levels, subject.unit, any_way(subject, begun.directed),
         subject.settings.optim.seed, most=config.bank,
     )  # fmt: skip
     for number, height in found:
@@ -166,6 +166,12 @@ def directions(subject: Subject, sheet: Sheet, directed: bool) -> Float[np.ndarr
     follows = name == "flow" or (name == "auto" and not directed)
     ahead = direction_field(sheet, wish, FLOW if follows else UP)
     return turned(ahead, sheet.normals, math.radians(style.rotation))
+
+
+def any_way(subject: Subject, directed: bool) -> bool:
+    """Whether the style's patches are taken in any rotation: a pattern without a direction, unless
+    the user gave it one."""
+    return not directed and subject.settings.style.direction == "auto"
 
 
 def exemplar_of_style(subject: Subject) -> MeshExemplar | PictureExemplar:

@@ -17,7 +17,7 @@
   }
   async function attempt(act) {
     complain("");
-    try { return await act(); } catch (error) { complain(error.message); }
+    try { return await act(); } catch (error) { if (state) update(); complain(error.message); }
   }
 
   // ---------------------------------------------------------------- controls to settings
@@ -98,6 +98,7 @@
     return { kind, balls: balls ? balls.split("+") : [] };
   };
   const strokes = byId("strokes");
+  const before = [];  // the masks before each stroke
   let stroke = null;
   function paint(on) {
     byId("paint").setAttribute("aria-pressed", String(on));
@@ -128,15 +129,22 @@
   });
   strokes.addEventListener("pointermove", (event) => { if (stroke) touch(event); });
   strokes.addEventListener("pointerup", () => {
-    const kind = byId("where").value, before = painted(state.settings.mask);
-    const balls = [...(before.kind === kind ? before.balls : []), ...stroke.map(({ text }) => text)];
+    const kind = byId("where").value, there = painted(state.settings.mask);
+    const balls = [...(there.kind === kind ? there.balls : []), ...stroke.map(({ text }) => text)];
     if (balls.length > MOST_BALLS) complain(`This is more than ${MOST_BALLS} dabs: take a larger brush, or paint a mask in your modelling program.`);
-    else if (stroke.length) change("mask", `${kind}:${balls.join("+")}`);
+    else if (stroke.length) {
+      before.push(state.settings.mask);
+      change("mask", `${kind}:${balls.join("+")}`);
+    }
     stroke = null;
     setTimeout(() => strokes.getContext("2d").clearRect(0, 0, strokes.width, strokes.height), 800);
   });
   byId("paint").addEventListener("click", () => paint(strokes.hidden));
-  byId("unpaint").addEventListener("click", () => change("mask", ""));
+  byId("undo").addEventListener("click", () => { if (before.length) change("mask", before.pop()); });
+  byId("unpaint").addEventListener("click", () => {
+    before.length = 0;
+    change("mask", "");
+  });
   byId("brush-size").addEventListener("input", () => { document.querySelector("output[for=brush-size]").value = byId("brush-size").value; });
 
   // ---------------------------------------------------------------- saving
@@ -209,6 +217,9 @@
   function update() {
     const { settings } = state, busy = !["done", "failed"].includes(state.stage);
     root.classList.toggle("busy", busy);
+    root.classList.toggle("failed", state.stage === "failed");
+    byId("draft").hidden = !state.result || state.finished || state.learned > 0;
+    byId("save").title = state.finished ? "" : "as soon as the result is finished";
     byId("stage-line").textContent = state.stage === "done" ? (state.finished ? "Done" : "Stopped")
       : state.stage + (/^(preparing|synthesising)/.test(state.stage) && state.detail ? `: ${state.detail}` : "");
     byId("size-line").textContent = state.result ? `${state.result.vertices.toLocaleString()} vertices` +
