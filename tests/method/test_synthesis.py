@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.ndimage import gaussian_filter
 
 import styleexp
 from styleexp.config import build
@@ -287,8 +288,17 @@ def test_flatten_takes_the_sources_own_bumps_off_as_far_as_the_relief_is_high():
         styleexp.stylize(*given, "baseline.flatten=2")
 
 
+@pytest.mark.parametrize(("length", "directed"), [(1, False), (4, True)])
+def test_long_forms_have_a_direction_though_they_have_no_spacing(length, directed):
+    noise = np.random.default_rng(0).normal(size=(300, 300))
+    blobs = gaussian_filter(noise, (3 * length, 3), mode="wrap")
+    found = measure(
+        PictureExemplar(torch.from_numpy(blobs).float(), 1 / 300), np.random.default_rng(0)
+    )
+    assert (found.coherence > synthesis.COHERENT) == directed
+
+
 def test_a_direction_that_is_asked_for_is_followed_by_a_pattern_without_one():
-    """Blobs that are longer than wide, but of no measurable direction, lie as the user says."""
     config = compose(["source=sphere", "style=bubble", "method=synthesis"])
     assert synthesis.any_way(build.subject_of(config, True), directed=False)
     assert not synthesis.any_way(build.subject_of(config, True), directed=True)

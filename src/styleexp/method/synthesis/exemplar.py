@@ -251,6 +251,9 @@ class Pattern:
     directed: float
     """Anisotropy: standard deviation of the autocovariance over directions at that distance,
     relative to that over all distances."""
+    coherence: float
+    """How much the slopes share one axis, 0 to 1: the coherence of their structure tensor (Bigün
+    and Granlund 1987). High for long forms without a common spacing, such as bark."""
     low: float
     high: float
     """``low`` and ``high`` are the 1st and 99th percentiles of the heights."""
@@ -283,7 +286,16 @@ def measure(exemplar: Exemplar, rng: np.random.Generator) -> Pattern:
     ring = along[:, (radii >= 0.8 * half) & (radii <= 1.2 * half)].mean(dim=1)
     directed = float(ring.std() / along.std().clamp(min=1e-6))
     low, high = np.percentile(patches.numpy(), [1, 99])
-    return Pattern(2 * half * spacing, directed, float(low), float(high))
+    coherence = _coherence(patches)
+    return Pattern(2 * half * spacing, directed, coherence, float(low), float(high))
+
+
+def _coherence(patches: Float[Tensor, "patches side side"]) -> float:
+    down = (patches[:, 1:, :-1] - patches[:, :-1, :-1]).flatten()
+    right = (patches[:, :-1, 1:] - patches[:, :-1, :-1]).flatten()
+    across, along = (right**2).mean() - (down**2).mean(), 2 * (right * down).mean()
+    energy = (right**2).mean() + (down**2).mean()
+    return float(torch.hypot(across, along) / energy.clamp(min=1e-20))
 
 
 def _first_trough(along: Float[Tensor, "angles radii"], radii: Float[Tensor, " radii"]) -> float:

@@ -36,7 +36,9 @@ if TYPE_CHECKING:
     from styleexp.method.synthesis.exemplar import Exemplar
 
 DIRECTED = 0.25
-"""A pattern has a direction if its `Pattern.directed` exceeds this."""
+"""A pattern has a direction if its `Pattern.directed` exceeds this, or its `Pattern.coherence` the
+next."""
+COHERENT = 0.3
 PER_WAVE = 5.4
 """Samples per wavelength at the coarsest level. The quilt already determines everything larger than
 a patch at this spacing; coarser patches would smooth it away."""
@@ -88,7 +90,7 @@ class Begun:
     @property
     def directed(self) -> bool:
         """Whether the pattern has a direction."""
-        return self.pattern.directed > DIRECTED
+        return self.pattern.directed > DIRECTED or self.pattern.coherence > COHERENT
 
 
 def relief(
