@@ -126,3 +126,14 @@ def test_a_run_writes_it_beside_its_result(tmp_path, capsys):
 def test_a_flap_is_taken_off_so_that_the_surface_is_closed():
     faces = np.array([[0, 1, 2], [3, 4, 5], [2, 1, 0], [0, 1, 3]])
     assert simplifying._doubled(faces).tolist() == [True, False, True, False]
+
+
+def test_a_sheet_with_two_sides_keeps_both():
+    rows, columns = (each.ravel() for each in np.mgrid[0:20, 0:20])
+    points = np.stack([rows, columns, np.zeros(400)], axis=1).astype(float)
+    at = np.arange(400).reshape(20, 20)
+    a, b, c, d = (each.ravel() for each in (at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]))
+    front = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    sheet = meshes.from_arrays(points, np.concatenate([front, front[:, ::-1]]))
+    small = simplifying.simplified(sheet, sheet.vertices, 100, 0.01)[0]
+    assert len(small.faces) > 0

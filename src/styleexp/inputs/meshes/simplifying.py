@@ -87,7 +87,8 @@ def simplified(
             **options | {"target_index_count": size(3 * faces)},
         )
     left = found[:count].reshape(-1, 3).astype(np.int64)
-    left = left[~_doubled(carrier.rows[row[left]])]
+    if not _doubled(mesh.faces).any():  # else it is a sheet with two sides
+        left = left[~_doubled(carrier.rows[row[left]])]
     like = first[left[:, 0]]
     left = np.where(carrier.flipped[like][:, None], left[:, ::-1], left)
     kept_rows, corners = np.unique(left, return_inverse=True)
