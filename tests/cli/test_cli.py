@@ -129,7 +129,7 @@ def test_an_interrupted_synthesis_says_how_to_run_it_again(tmp_path):
     assert process.stdout is not None
     assert any("wavelength" in line for line in process.stdout)  # it is at work
     process.send_signal(signal.SIGINT)
-    _, told = process.communicate(timeout=120)
+    _, told = process.communicate(timeout=300)
     assert process.returncode == 130
     assert f"stopped; rerun with: styleexp resume={folder}" in told
     assert json.loads((folder / "status.json").read_text())["status"] == "interrupted"

@@ -30,7 +30,13 @@ def print_paths(paths: Iterable[Path]) -> None:
     from rich.console import Console
     from rich.text import Text
 
-    console = Console(soft_wrap=True)
+    class Plain(Console):
+        """rich would send all later output nowhere, without a word if it is in a thread."""
+
+        def on_broken_pipe(self) -> None:
+            raise
+
+    console = Plain(soft_wrap=True)
     for path in paths:
         absolute = path.resolve()
         console.print(Text("  ").append(str(path), style=f"link {absolute.as_uri()}"))
