@@ -11,12 +11,12 @@ MESH.glb is the source's file (`styleexp-assets where critter_low`). Needs .venv
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 
 import bpy
 from mathutils import Vector
+from staging import aimed, render
 
 APART = 0.92
 """Distance between two of them, in heights."""
@@ -53,11 +53,6 @@ def plain(name: str, color: tuple[float, float, float, float]) -> bpy.types.Mate
     return material
 
 
-def aimed(thing: bpy.types.Object, at: tuple[float, float, float]) -> None:
-    """Turn a camera or a light towards a point."""
-    thing.rotation_euler = (Vector(at) - thing.location).to_track_quat("-Z", "Y").to_euler()
-
-
 def stage() -> None:
     """A floor, a camera and three lights."""
     scene = bpy.context.scene
@@ -89,17 +84,7 @@ def main(mesh: Path, run: Path, target: Path) -> None:
     brought_in(run / "result.glb", 0, False)
     brought_in(run / "bake" / "result_low.glb", APART, False)
     stage()
-    scene = bpy.context.scene
-    scene.render.engine = "CYCLES"
-    scene.cycles.device, scene.cycles.samples = "CPU", int(os.environ.get("SAMPLES", "32"))
-    scene.cycles.use_denoising = True
-    scene.render.threads_mode, scene.render.threads = "FIXED", 1
-    scene.render.resolution_x, scene.render.resolution_y = 1440, 520
-    scene.render.resolution_percentage = int(os.environ.get("PERCENT", "100"))
-    scene.render.image_settings.compression = 100
-    scene.view_settings.view_transform = "AgX"
-    scene.render.filepath = str(target.resolve())
-    bpy.ops.render.render(write_still=True)
+    render(target, 1440, 520)
 
 
 if __name__ == "__main__":

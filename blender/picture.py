@@ -18,7 +18,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 os.environ["BLENDER_USER_RESOURCES"] = tempfile.mkdtemp(prefix="styleexp-blender-")
 import bpy  # noqa: E402 - reads the variable
-from mathutils import Vector  # noqa: E402
+from staging import aimed, render  # noqa: E402
 
 NAME = "bl_ext.user_default.styleexp"
 STYLE, SCALE, STRENGTH, SEED = "scales", 0.75, 0.8, 0
@@ -72,11 +72,6 @@ def suzanne(place: float) -> bpy.types.Object:
     return thing
 
 
-def aimed(thing: bpy.types.Object, at: tuple[float, float, float]) -> None:
-    """Turn a camera or a light towards a point."""
-    thing.rotation_euler = (Vector(at) - thing.location).to_track_quat("-Z", "Y").to_euler()
-
-
 def stage() -> None:
     """A floor, a camera and three lights."""
     scene = bpy.context.scene
@@ -119,17 +114,7 @@ def main(target: Path, folder: str) -> None:
     choice.mask = "skin"
     bpy.ops.object.styleexp_stylize()
     stage()
-    scene = bpy.context.scene
-    scene.render.engine = "CYCLES"
-    scene.cycles.device, scene.cycles.samples = "CPU", int(os.environ.get("SAMPLES", "32"))
-    scene.cycles.use_denoising = True
-    scene.render.threads_mode, scene.render.threads = "FIXED", 1
-    scene.render.resolution_x, scene.render.resolution_y = 1200, 560
-    scene.render.resolution_percentage = int(os.environ.get("PERCENT", "100"))
-    scene.render.image_settings.compression = 100
-    scene.view_settings.view_transform = "AgX"
-    scene.render.filepath = str(target.resolve())
-    bpy.ops.render.render(write_still=True)
+    render(target, 1200, 560)
     shutil.rmtree(os.environ["BLENDER_USER_RESOURCES"])
 
 

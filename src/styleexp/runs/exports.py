@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,11 +19,9 @@ if TYPE_CHECKING:
 ALWAYS = ("ply", "obj", "glb")
 LOSS = 0.05
 """Largest estimated distance of a simplified result from the result, as a fraction of the relief's
-range. A half of the faces is gone at 0.02, three quarters at 0.04."""
+range. On two pairs about half of the faces were gone at 0.02, three quarters at 0.04."""
 RANGE = (0.01, 0.99)
 """Quantiles of the displacement between which its range is measured."""
-
-Write = Callable[[str, Callable[[Path], None]], None]
 
 
 def write(result: Result, config: Config, folder: Path) -> list[str]:

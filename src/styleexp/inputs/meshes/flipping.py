@@ -22,8 +22,8 @@ CLEARLY = 1e-3
 
 def flipped(vertices: Float[np.ndarray, "vertices 3"], carrier: Carrier, longest: float) -> Carrier:
     """Flip edges between nearly coplanar faces towards a Delaunay triangulation (the angles
-    opposite an edge sum to at most pi), which has the fewest slivers. No edge becomes longer, but
-    up to ``longest``.
+    opposite an edge sum to at most pi), which has the fewest slivers. A new edge is no longer
+    than the old one or ``longest``.
 
     Edges on texture seams, borders, creases, and between materials, parts or groups stay; so do
     the rows.
