@@ -211,10 +211,12 @@ def test_refined_result_knows_its_place_on_the_original(tmp_path):
     assert isinstance(found, surface.Refined)
     assert len(found.points) == len(mesh.vertices)  # nothing torn at seams
     assert len(found.faces) == len(mesh.faces) > 4 * len(source.triangles)
-    height = source.points[:, 2]  # linear along the tube, also where its round is refined
+    # Linear along the tube, but for what the curves across its triangles, whose diagonals lean
+    # to one side, move along it.
+    height = source.points[:, 2]
     np.testing.assert_allclose(
         found.of_vertices(source, height)[found.displacement == 0],
-        found.points[found.displacement == 0, 2], atol=1e-4,
+        found.points[found.displacement == 0, 2], atol=1e-3,
     )  # fmt: skip
     # Texture coordinates have no triangle across the seam, and are those the command interpolates.
     uv = found.of_corners(source, source.uv).reshape(-1, 3, 2)
