@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -65,7 +65,10 @@ def stylize(source: MeshLike, style: MeshLike | np.ndarray, *overrides: str) -> 
 
 
 def configured(
-    source: MeshLike, style: MeshLike | np.ndarray, overrides: Sequence[str]
+    source: MeshLike,
+    style: MeshLike | np.ndarray,
+    overrides: Sequence[str],
+    composed: Callable[[Sequence[str]], Config] = compose,
 ) -> tuple[Config, dict[str, Any]]:
     """The configuration of a run, and the in-memory source and style, by key."""
     from hydra.errors import HydraException
@@ -79,7 +82,7 @@ def configured(
     named = {"source": source, "style": style}
     known = isinstance(style, str) and plugins.known("style", style)
     try:
-        config = compose([*([f"style={style}"] if known else []), *overrides])
+        config = composed([*([f"style={style}"] if known else []), *overrides])
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(explain(error)) from error
     given = {}

@@ -14,7 +14,7 @@ import pytest
 from styleexp.cli.report import main
 from styleexp.experiments.reports import charts, glb, html, page, shown, sweep_page
 from styleexp.inputs import shapes
-from styleexp.inputs.meshes import load_mesh, save_mesh, vertex_normals
+from styleexp.inputs.meshes import edges_of, load_mesh, save_mesh, vertex_normals
 from styleexp.runs import finding, reading
 from styleexp.system.errors import UserError
 
@@ -80,10 +80,10 @@ def test_glb_holds_the_mesh_to_a_fraction_of_a_pixel():
 
 def test_edges_are_each_there_once():
     mesh = shapes.make("torus")
-    edges = glb.edges(mesh.faces)
+    edges = edges_of(mesh.faces)
     assert len(edges) == len(mesh.vertices) + len(mesh.faces)  # Euler: V - E + F = 0
     assert len({tuple(sorted(edge)) for edge in edges.tolist()}) == len(edges)
-    assert glb.edges(np.zeros((0, 3), np.int64)).shape == (0, 2)
+    assert edges_of(np.zeros((0, 3), np.int64)).shape == (0, 2)
 
 
 def test_large_meshes_have_wide_indices_and_huge_ones_no_edges(monkeypatch):

@@ -119,6 +119,13 @@ def test_wavelength_and_direction_are_measured(style, shortest, longest, directe
     assert (found.directed > DIRECTED) == directed
 
 
+def test_the_measured_wavelength_does_not_depend_on_the_seed():
+    rail = exemplar_of(shapes.make("rail"))
+    found = [measure(rail, np.random.default_rng(seed)) for seed in range(4)]
+    assert np.ptp([each.wavelength for each in found]) < 1e-9
+    assert np.ptp([each.directed for each in found]) < 0.05
+
+
 def test_a_pictures_waves_are_measured_in_its_own_size():
     rows = torch.arange(256) / 256
     waves = torch.sin(2 * np.pi * 8 * rows)[:, None].expand(256, 256)

@@ -10,6 +10,8 @@ import numpy as np
 import torch
 from torch.autograd.function import once_differentiable
 
+from styleexp.inputs import meshes
+
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from torch import Tensor
@@ -32,8 +34,7 @@ class Diffusion:
         if smoothness < 0:
             raise ValueError(f"lambda is {smoothness}, but can't be negative")
         corners = faces.detach().cpu().numpy()
-        ends = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
-        edges = np.unique(np.sort(ends, axis=1), axis=0)
+        edges = meshes.edges_of(corners)
         edges = edges[edges[:, 0] != edges[:, 1]]
         ones = np.ones(len(edges))
         half = coo_matrix((ones, (edges[:, 0], edges[:, 1])), shape=(vertices, vertices))

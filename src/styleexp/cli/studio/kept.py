@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from styleexp.api import configured
 from styleexp.config import build, sources
 from styleexp.config.checks import check
+from styleexp.config.compose import compose
 from styleexp.inputs import meshes
 from styleexp.inputs.style import Style
 from styleexp.method import masks
@@ -20,6 +23,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from styleexp.cli.studio.settings import Settings
+    from styleexp.config.schema import Config
     from styleexp.method.subject import Subject
 
 
@@ -28,6 +32,14 @@ class Kept:
 
     def __init__(self) -> None:
         self._kept: dict[str, tuple[Any, Any]] = {}
+        # A third of a second each time; sources and styles are named afterwards.
+        self._composed = lru_cache(64)(compose)
+
+    def _config(self, settings: Settings, overrides: Sequence[str]) -> Config:
+        def composed(words: Sequence[str]) -> Config:
+            return deepcopy(self._composed(tuple(words)))
+
+        return configured(settings.source, settings.style, overrides, composed)[0]
 
     def clear(self) -> None:
         """Drop everything, because a file was replaced under the same name."""
@@ -43,7 +55,7 @@ class Kept:
         """The source and the style as read."""
 
         def named() -> Any:
-            config, _ = configured(settings.source, settings.style, [])
+            config = self._config(settings, [])
             sources.check(config)
             return config
 
@@ -62,7 +74,7 @@ class Kept:
         assert given is not None
 
         def config(more: tuple[str, ...] = ()) -> Any:
-            return configured(settings.source, settings.style, [*settings.overrides, *more])[0]
+            return self._config(settings, [*settings.overrides, *more])
 
         with sources.given(source=mesh, style=given):
             yield config, (mesh, style)
@@ -75,8 +87,7 @@ class Kept:
 
         def make() -> Subject:
             plain = replace(settings, mask="", strength=1.0, direction="auto", rotation=0.0)
-            options = configured(settings.source, settings.style, [*plain.overrides, *more])[0]
-            return build.subject_of(options, True)
+            return build.subject_of(self._config(settings, [*plain.overrides, *more]), True)
 
         key = (settings.source, settings.style, settings.scale, settings.invert, settings.seed)
         subject: Subject = self._get(f"subject {more}", key, make)

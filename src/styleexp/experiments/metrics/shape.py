@@ -128,8 +128,7 @@ def bend(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> f
     """99th percentile, over the edges, of the difference of the unit normals at an edge's ends: 0
     for a smooth surface, up to 2 where it is crumpled."""
     normals = meshes.vertex_normals(vertices, faces)
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    a, b = np.unique(edges, axis=0).T
+    a, b = meshes.edges_of(faces).T
     return float(np.percentile(np.linalg.norm(normals[a] - normals[b], axis=1), 99))
 
 

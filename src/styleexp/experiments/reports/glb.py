@@ -74,7 +74,7 @@ def glb(
     elif not bare:
         primitives.append(surface)  # so that the edges are always node 2
     if len(faces) <= WIREFRAME_FACES and not bare:
-        lines = buffer.indices(edges(faces))
+        lines = buffer.indices(meshes.edges_of(faces))
         materials.append(_material(INK) | {"extensions": {"KHR_materials_unlit": {}}})
         primitives.append(
             {
@@ -98,14 +98,6 @@ def glb(
             **extra,
         }
     )
-
-
-def edges(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "edges 2"]:
-    """Each edge once, the smaller vertex first."""
-    ends = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
-    size = int(faces.max(initial=0)) + 1
-    keys = np.unique(ends[:, 0] * size + ends[:, 1])
-    return np.stack([keys // size, keys % size], axis=1)
 
 
 def diverging(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:

@@ -203,7 +203,7 @@ def mean(frame: pandas.DataFrame, metric: str, **where: Any) -> float:
 def slope(path: str | Path) -> float:
     """RMS slope of the displacement along the result's edges: how steep and, relative to the
     height, how fine the relief is. NaN without a result."""
-    from styleexp.experiments.reports.glb import edges
+    from styleexp.inputs.meshes import edges_of
 
     file = Path(path) / results.NAME
     if not file.is_file():
@@ -211,7 +211,7 @@ def slope(path: str | Path) -> float:
     result = results.read(file)
     if result.displacement is None:
         return math.nan
-    a, b = edges(result.faces).T
+    a, b = edges_of(result.faces).T
     length = np.linalg.norm(result.vertices[a] - result.vertices[b], axis=1)
     steep = np.abs(result.displacement[a] - result.displacement[b])[length > 0] / length[length > 0]
     return float(np.sqrt(np.square(steep).mean()))

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from styleexp.inputs.meshes.mesh import Mesh as Mesh
 from styleexp.inputs.meshes.mesh import Normalisation as Normalisation
+from styleexp.inputs.meshes.mesh import edges_of as edges_of
 from styleexp.inputs.meshes.mesh import face_areas as face_areas
 from styleexp.inputs.meshes.mesh import mean_edge_length as mean_edge_length
 from styleexp.inputs.meshes.mesh import normalisation as normalisation

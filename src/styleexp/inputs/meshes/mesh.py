@@ -154,14 +154,22 @@ def vertex_normals(
     return normals / length
 
 
+def edges_of(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "edges 2"]:
+    """The edges, each once, its lower vertex first, in ascending order."""
+    count = int(faces.max(initial=-1)) + 1
+    after = np.roll(faces, -1, axis=1)
+    keys = np.minimum(faces, after).astype(np.int64) * count + np.maximum(faces, after)
+    keys = np.sort(keys, axis=None)  # quicker than np.unique, which hashes first
+    keys = keys[np.diff(keys, prepend=-1) > 0]
+    return np.stack(np.divmod(keys, max(count, 1)), axis=1)
+
+
 def mean_edge_length(
     vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
 ) -> float:
     """Mean length of the edges, each counted once."""
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    edges = np.unique(edges[:, 0] * len(vertices) + edges[:, 1])
-    ends = vertices[np.stack([edges // len(vertices), edges % len(vertices)], axis=1)]
-    return float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean())
+    a, b = edges_of(faces).T
+    return float(np.linalg.norm(vertices[a] - vertices[b], axis=1).mean())
 
 
 def _crosses(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

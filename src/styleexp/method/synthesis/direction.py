@@ -8,6 +8,8 @@ import numpy as np
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import cg
 
+from styleexp.inputs import meshes
+
 if TYPE_CHECKING:
     from jaxtyping import Float
 
@@ -30,8 +32,7 @@ def direction_field(
     """
     vertices, normals = sheet.vertices, sheet.normals
     x, y = frames(normals)
-    edges = np.concatenate([sheet.faces[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
-    edges = np.unique(np.sort(edges, axis=1), axis=0)
+    edges = meshes.edges_of(sheet.faces)
     a, b = edges[edges[:, 0] != edges[:, 1]].T
     along = vertices[b] - vertices[a]
     turn = [np.arctan2((along * y[k]).sum(1), (along * x[k]).sum(1)) for k in (a, b)]

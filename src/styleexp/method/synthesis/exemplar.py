@@ -36,6 +36,9 @@ taken, because patterns rotate around poles of the direction field."""
 SPECTRUM = 25
 """Samples per side of the patches used to measure the wavelength."""
 
+MEASURED = 300
+"""Patches used to measure the pattern."""
+
 CLEAR = 0.05
 """Significant rise of the heights' autocovariance, as a fraction of their variance."""
 
@@ -274,10 +277,8 @@ def measure(exemplar: Exemplar, rng: np.random.Generator) -> Pattern:
     """Measure wavelength, direction and height of an exemplar from its autocovariance."""
     for samples in (60, 150, 375):
         spacing = exemplar.extent / samples
-        patches, _ = exemplar.sample(1000, SPECTRUM, spacing, rng, any_way=False)
-        centred = patches - patches.mean()
-        middle = centred[:, SPECTRUM // 2, SPECTRUM // 2, None, None]
-        likeness = (middle * centred).mean(0) / centred.square().mean().clamp(min=1e-20)
+        patches, _ = exemplar.sample(MEASURED, SPECTRUM, spacing, rng, any_way=False)
+        likeness = _autocorrelation(patches - patches.mean())
         radii = torch.arange(0, SPECTRUM // 2 + 0.01, 0.5)
         along = _polar(likeness, radii, torch.arange(0, 24) * (np.pi / 24))
         half = _first_trough(along, radii)
@@ -288,6 +289,20 @@ def measure(exemplar: Exemplar, rng: np.random.Generator) -> Pattern:
     low, high = np.percentile(patches.numpy(), [1, 99])
     coherence = _coherence(patches)
     return Pattern(2 * half * spacing, directed, coherence, float(low), float(high))
+
+
+def _autocorrelation(centred: Float[Tensor, "patches side side"]) -> Float[Tensor, "side side"]:
+    """Mean product of two heights, by their offset, over all pairs within the patches; 1 at offset
+    0, which is in the middle."""
+    side = centred.shape[1]
+    size = (2 * side, 2 * side)  # so that nothing wraps around
+    power = torch.fft.rfft2(centred.double(), s=size).abs().square().mean(0)
+    among = torch.fft.rfft2(torch.ones(side, side, dtype=torch.float64), s=size).abs().square()
+    products, pairs = (
+        torch.fft.irfft2(each, s=size).roll((side // 2, side // 2), (0, 1))[:side, :side]
+        for each in (power, among)
+    )
+    return (products / pairs / centred.square().mean().clamp(min=1e-20)).float()
 
 
 def _coherence(patches: Float[Tensor, "patches side side"]) -> float:

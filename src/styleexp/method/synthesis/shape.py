@@ -22,6 +22,8 @@ from styleexp.method.synthesis.walk import Sheet
 from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from jaxtyping import Float, Int
 
 LENGTHS = (0.5, 0.25, 0.125, 0.0625)
@@ -91,7 +93,7 @@ def _along_itself(mesh: meshes.Mesh, length: float | None) -> MeshExemplar | Non
     coarse = meshes.mean_edge_length(mesh.vertices, mesh.faces) > COARSE
     mesh = meshes.refine(mesh, COARSE if coarse else 2.5 * COARSE)
     lengths = LENGTHS if length is None else (length, length / 2)
-    parted = [_smoothed(mesh, each) for each in lengths]
+    parted = _smoothed(mesh, lengths)
     energy = np.array([np.average(h**2, weights=sheet.areas) ** 0.5 for sheet, h in parted])
     kept = energy[1:] / energy[:-1].clip(min=1e-12)
     best = int(kept.argmax())
@@ -100,9 +102,11 @@ def _along_itself(mesh: meshes.Mesh, length: float | None) -> MeshExemplar | Non
     return _exemplar(*parted[best], lengths[best])
 
 
-def _smoothed(mesh: meshes.Mesh, length: float) -> tuple[Sheet, Float[np.ndarray, " vertices"]]:
-    """Smooth with the cotangent Laplacian, not the graph Laplacian, so that a non-uniform mesh of a
-    smooth ball has no relief."""
+def _smoothed(
+    mesh: meshes.Mesh, lengths: Sequence[float]
+) -> list[tuple[Sheet, Float[np.ndarray, " vertices"]]]:
+    """The surface smoothed by each length, and the heights above it. The Laplacian is cotangent,
+    not the graph Laplacian, so that a non-uniform mesh of a smooth ball has no relief."""
     import gpytoolbox
 
     vertices = mesh.vertices
@@ -110,18 +114,21 @@ def _smoothed(mesh: meshes.Mesh, length: float) -> tuple[Sheet, Float[np.ndarray
     laplacian.data = np.nan_to_num(laplacian.data, posinf=0.0, neginf=0.0)  # from zero-area faces
     area = Sheet(vertices, mesh.faces).areas
     mass = area.clip(min=1e-9 * area.mean())
-    # Damps a wave of this length to a fifth, like `relief.smoother`.
-    time = 4 * (length / (2 * np.pi)) ** 2
-    matrix = (diags(mass) + time * laplacian).tocsr()
-    inverse = diags(1 / matrix.diagonal())
-    columns = [cg(matrix, mass * each, each, rtol=1e-8, M=inverse)[0] for each in vertices.T]
-    base = np.stack(columns, axis=1)
-    normals = meshes.vertex_normals(base, mesh.faces)
-    height = ((vertices - base) * normals).sum(axis=1)
-    # Smoothing also moves vertices sideways, off steep walls; the height must stay below its
-    # vertex.
-    base = vertices - height[:, None] * normals
-    return Sheet(base, mesh.faces, normals), height - height.mean()
+    parted = []
+    for length in lengths:
+        # Damps a wave of this length to a fifth, like `relief.smoother`.
+        time = 4 * (length / (2 * np.pi)) ** 2
+        matrix = (diags(mass) + time * laplacian).tocsr()
+        inverse = diags(1 / matrix.diagonal())
+        columns = [cg(matrix, mass * each, each, rtol=1e-8, M=inverse)[0] for each in vertices.T]
+        base = np.stack(columns, axis=1)
+        normals = meshes.vertex_normals(base, mesh.faces)
+        height = ((vertices - base) * normals).sum(axis=1)
+        # Smoothing also moves vertices sideways, off steep walls; the height must stay below its
+        # vertex.
+        base = vertices - height[:, None] * normals
+        parted.append((Sheet(base, mesh.faces, normals), height - height.mean()))
+    return parted
 
 
 def _exemplar(sheet: Sheet, height: Float[np.ndarray, " vertices"], length: float) -> MeshExemplar:
@@ -181,9 +188,7 @@ def _seen(mesh: meshes.Mesh) -> meshes.Mesh:
 
 def _handles(faces: Int[np.ndarray, "faces 3"]) -> float:
     """Genus of a closed surface; a lower value for an open one."""
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    count = len(np.unique(edges, axis=0))
-    return 1 - (len(np.unique(faces)) - count + len(faces)) / 2
+    return 1 - (len(np.unique(faces)) - len(meshes.edges_of(faces)) + len(faces)) / 2
 
 
 def _outside(mesh: meshes.Mesh, length: float) -> MeshExemplar | None:

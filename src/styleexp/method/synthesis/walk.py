@@ -38,8 +38,16 @@ class Sheet:
         self.vertices = np.ascontiguousarray(vertices, dtype=np.float64)
         self.faces = faces
         self.normals = meshes.vertex_normals(vertices, faces) if normals is None else normals
-        self.edge = meshes.mean_edge_length(vertices, faces)
-        self.tree = cKDTree(self.vertices)
+
+    @cached_property
+    def edge(self) -> float:
+        """Mean length of the edges."""
+        return meshes.mean_edge_length(self.vertices, self.faces)
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """The vertices, for looking up the nearest."""
+        return cKDTree(self.vertices)
 
     def nearest(self, points: Float[np.ndarray, "points 3"]) -> Int[np.ndarray, " points"]:
         """Index of the vertex nearest to each point."""
@@ -120,8 +128,9 @@ class Sheet:
         self, points: Float[np.ndarray, "... 3"], nears: Int[np.ndarray, ...]
     ) -> Bool[np.ndarray, ...]:
         """Whether points, given with their nearest vertices, are within the mesh's boundary."""
-        away = np.linalg.norm(points - self.vertices[nears], axis=-1)
-        return away < 1.5 * self._reach[nears]
+        away = points - self.vertices[nears]
+        reach = (1.5 * self._reach) ** 2
+        return np.einsum("...i,...i->...", away, away) < reach[nears]
 
     def spread(self, distance: float, rng: np.random.Generator) -> Int[np.ndarray, " chosen"]:
         """Evenly spread vertices, about ``distance`` apart: one per grid cell."""
@@ -163,15 +172,13 @@ class Sheet:
         most = int(min(valence.max(), MOST_FACES))
         kept = place < most
         others = np.tile(np.arange(count)[:, None, None], (1, most, 2))
-        vertex = corner[order]
-        pair = np.stack([self.faces[face, (which + k) % 3] for k in (1, 2)], axis=1)
-        others[vertex[kept], place[kept]] = pair[kept]
-        edges = self.vertices[others] - self.vertices[:, None, None]
-        gram = np.einsum("vfad,vfbd->vfab", edges, edges)
-        largest = np.trace(gram, axis1=2, axis2=3)[..., None, None]
-        gram += np.eye(2) * (1e-9 * largest + 1e-30)
-        solve = np.linalg.solve(gram, edges)
-        return torch.from_numpy(others), torch.from_numpy(solve).float(), valence.clip(1, most)
+        basis = np.zeros((count, most, 2, 3), dtype=np.float32)
+        at = corner[order][kept], place[kept]
+        others[at] = pair = np.stack(
+            [self.faces[face, (which + k) % 3][kept] for k in (1, 2)], axis=1
+        )
+        basis[at] = _dual(*(self.vertices[pair[:, k]] - self.vertices[at[0]] for k in (0, 1)))
+        return torch.from_numpy(others), torch.from_numpy(basis), valence.clip(1, most)
 
     def interpolation(
         self, points: Float[np.ndarray, "points 3"], nears: Int[np.ndarray, " points"]
@@ -203,3 +210,14 @@ class Sheet:
         begins = np.arange(len(points) + 1) * 3
         shape = (len(points), len(self.vertices))
         return csr_matrix((weight.numpy().ravel(), column.numpy().ravel(), begins), shape)
+
+
+def _dual(
+    one: Float[np.ndarray, "pairs 3"], two: Float[np.ndarray, "pairs 3"]
+) -> Float[np.ndarray, "pairs 2 3"]:
+    """The vectors whose products with a point give its coordinates along two edges; finite also for
+    parallel edges."""
+    a, b, c = ((x * y).sum(axis=1, keepdims=True) for x, y in ((one, one), (one, two), (two, two)))
+    slack = 1e-9 * (a + c) + 1e-30
+    a, c = a + slack, c + slack
+    return np.stack([c * one - b * two, a * two - b * one], axis=1) / (a * c - b * b)[..., None]
