@@ -148,7 +148,7 @@ def configuration():
         "# Configuration",
         "Every key of a run, as `styleexp KEY=VALUE` takes it, with the default of the schema. "
         "Presets (`method=`, `profile=`, `layers=`, …) set others: `method=synthesis`, which every "
-        "run starts from, sets `baseline` and `source.refine=auto`. `styleexp --help` shows the "
+        "run starts from, sets `baseline` and `source.refine=auto`. `styleexp --help-all` shows the "
         "values that a choice of them gives. This page is made from "
         "`styleexp/config/schema.py` and the options of the registered parts when the site is built.",
     ]

@@ -264,7 +264,7 @@ def test_works_from_an_empty_folder_with_relative_paths_and_odd_names(tmp_path):
 
 def test_help_lists_the_choices_and_loads_nothing_heavy(tmp_path):
     code = (
-        "import sys; sys.argv = ['styleexp', '--help']\n"
+        "import sys; sys.argv = ['styleexp', '--help-all']\n"
         "from styleexp.cli.main import main\n"
         "try: main()\nexcept SystemExit: pass\n"
         "heavy = {'torch', 'mitsuba', 'moderngl', 'pyrender', 'trimesh', 'scipy', 'onnx'}\n"
@@ -430,7 +430,8 @@ def test_a_refusal_loads_no_torch_and_leaves_no_folder(arguments, told, tmp_path
 
 
 @pytest.mark.parametrize(
-    "words", ["styleexp --help", "styleexp.cli.assets list", "styleexp.cli.plugins"]
+    "words",
+    ["styleexp --help", "styleexp --help-all", "styleexp.cli.assets list", "styleexp.cli.plugins"],
 )
 def test_what_is_printed_may_be_cut_off(words, tmp_path):
     done = subprocess.run(

@@ -31,7 +31,7 @@ FILES = (
 
 def printed():
     """Every command, without its comment, as words; with the page that has it first."""
-    from styleexp.cli.main import USAGE
+    from styleexp.cli.main import HELP, USAGE
     from styleexp.config.compose import _header
 
     found = {}
@@ -44,7 +44,7 @@ def printed():
             if code and re.match(r" *(\w+=\S+ )*styleexp(-\w+)? ", line):
                 words = shlex.split(line, comments=True)
                 found.setdefault(tuple(words), page.name)
-    for text in (USAGE, _header([])):
+    for text in (USAGE, HELP, _header([])):
         for line in re.findall(r"^  (styleexp .*)$", text, re.MULTILINE):
             words = shlex.split(re.split(r"  +", line)[0])
             found.setdefault(tuple(words), "--help")
@@ -57,7 +57,7 @@ def runs(words):
     return (
         words[0] == "styleexp"
         and not words[1].startswith("/")  # a file list of a container's recipe
-        and words[1] not in ("reproduce", "--help", "--version")
+        and words[1] not in ("reproduce", "--help", "--help-all", "--version")
         and "resume=" not in told
         and "search" not in told  # a search draws its jobs' values
         and not any(name in told for name in GUIDES)

@@ -405,7 +405,7 @@ def test_the_guides_file_works_without_a_package(tmp_path):
     ],
 )
 def test_a_mistake_in_the_variable_is_told_at_once(value, told, tmp_path):
-    done = styleexp("--help", cwd=tmp_path, STYLEEXP_PLUGINS=value)
+    done = styleexp("--help-all", cwd=tmp_path, STYLEEXP_PLUGINS=value)
     assert done.returncode == 0
     assert "warning: STYLEEXP_PLUGINS: " in done.stderr
     assert told in done.stderr
@@ -486,7 +486,7 @@ def test_the_example_in_a_fresh_environment(tmp_path):
     assert done.returncode == 0, done.stderr
 
     pip("uninstall", "--quiet", "--yes", "styleexp-plugin-example")
-    shown = process(command, "--help", cwd=tmp_path)
+    shown = process(command, "--help-all", cwd=tmp_path)
     assert "soft_raster" in options(shown.stdout)
     assert "example_normals" not in options(shown.stdout)
     done = process(command, "renderer=example_normals", cwd=tmp_path)

@@ -25,8 +25,34 @@ Put the local geometry of STYLE, a mesh or a picture, onto the mesh SOURCE. Both
   styleexp my.obj her.ply method=robust   learned from renders, as in the paper: slower
   styleexp resume=FOLDER                  continue a stopped run
   styleexp reproduce FOLDER               make a finished run again, and compare
+"""
+MORE = """
+styleexp --help names the keys used most.
+"""
+HELP = """
+Keys used most:
 
-styleexp --help lists all keys and choices, and styleexp-assets list all names.
+  strength=0.5              height of the relief; negative values turn bumps into dents
+  style.scale=2             size of the pattern
+  style.rotation=30         in degrees
+  style.direction=up        what the pattern's up follows: up, flow, x, y, z, attribute:NAME
+  style.mask=not:slope:60   where: slope:, height:, near:, color:, texture:, attribute:
+  style.invert=true         of a picture, dark is high
+  source.refine=none        keep the source's faces; or their number, or auto
+  simplify=50000            at most so many faces in the result
+  formats=[stl,3mf]         further files
+  optim.seed=1              another variation
+  method=robust             how; also paper, vertex, displacement_map, ...
+  profile=smoke             of learned methods: smoke, fast, standard, full
+  hydra.run.dir=FOLDER      where the results go
+
+  styleexp --help-all [KEY=VALUE ...]    all keys, with their values for these choices
+  styleexp +experiment=layer_ablation -m    an experiment of the paper
+
+Other commands, each with --help: styleexp-studio (a page to try things on),
+styleexp-assets (names, downloads), styleexp-bake (maps), styleexp-report and
+styleexp-metrics (of finished runs), styleexp-sweep (many runs), styleexp-plugins,
+styleexp-bench. Tracebacks: debug=true.
 """
 
 
@@ -61,8 +87,12 @@ def _command(given: list[str]) -> None:
     except FileNotFoundError:
         raise UserError("the current folder no longer exists: change to another.") from None
     if not given:
-        print(USAGE, end="", file=sys.stderr)
+        print(USAGE + MORE, end="", file=sys.stderr)
         sys.exit(2)
+    if given in (["--help"], ["-h"]):
+        print(USAGE + HELP, end="")
+        return
+    given = ["--help" if word == "--help-all" else word for word in given]
     if "--version" in given:
         from styleexp import __version__
 

@@ -7,6 +7,12 @@ import re
 
 UNKNOWN_CHOICE = r"Could not find '([\w/]+)/([^'/]+)'"
 """Hydra's message for an unknown option name."""
+UNFIT = re.compile(
+    r"Error merging override ([^\n]*)\nValue '[^\n]*' "
+    r"(?:of type '\w+' could not be converted to|is not a valid) (Float|Integer|bool)"
+)
+"""OmegaConf's message for a value of another type."""
+WANTED = {"Float": "a number", "Integer": "a whole number", "bool": "true or false"}
 HYDRA_PLUGINS = {"hydra/launcher": "sweep", "hydra/sweeper": "search"}
 """Config groups provided by Hydra plugins, and the extra that installs them."""
 
@@ -36,8 +42,8 @@ def explain(error: BaseException) -> str:
                 f"Hydra's plugin '{choice[2]}' is not installed: pip install 'styleexp[{extra}]'."
             )
         return str(unknown_name(choice[1], choice[2], _options(choice[1])))
-    key = re.search(r"Key '(\w+)' (?:is )?not in", text)
-    if key:
+    unknown = re.search(r"Key '(\w+)' (?:is )?not in", text)
+    if unknown:
         from styleexp.config.schema import Config
 
         known = _keys(Config)
@@ -45,10 +51,16 @@ def explain(error: BaseException) -> str:
             section = full[1]
             own = [k for k in [*known, *_keys_of_parts(section)] if k.startswith(f"{section}.")]
             known = own or known
-        near = difflib.get_close_matches(key[1], [k.split(".")[-1] for k in known], n=1)
+        near = difflib.get_close_matches(unknown[1], [k.split(".")[-1] for k in known], n=1)
         meant = [k for k in known if near and k.split(".")[-1] == near[0]]
         hint = f"did you mean {' or '.join(dict.fromkeys(meant))}? " if meant else ""
-        return f"there is no key '{key[1]}': {hint}'styleexp --help' lists the keys."
+        if full and not meant:
+            of_it = ", ".join(sorted(dict.fromkeys(k.removeprefix(f"{section}.") for k in known)))
+            return f"{section} has no key '{unknown[1]}', only {of_it}."
+        return f"there is no key '{unknown[1]}': {hint}'styleexp --help-all' lists the keys."
+    if unfit := UNFIT.search(text):
+        key, _, value = unfit[1].strip().partition("=")
+        return f"{key} must be {WANTED[unfit[2]]}, not '{value}'."
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     kept = [x for x in lines if not x.startswith(("full_key", "object_type", "reference_type"))]
     return ": ".join(dict.fromkeys(kept)) or type(error).__name__

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from styleexp import plugins
 from styleexp.inputs import assets, images, meshes, shapes
+from styleexp.inputs.meshes import heads
 from styleexp.inputs.style import Style
 from styleexp.system.errors import UserError, unknown_name
 from styleexp.system.progress import doing
@@ -64,9 +65,10 @@ def given(**parts: meshes.Mesh | np.ndarray) -> Iterator[None]:
 
 
 def check(config: Config) -> None:
-    """Raise `UserError` if a source, style or mask file is missing or has an unsupported type.
+    """Raise `UserError` if a source, style or mask file is missing, has an unsupported type, or
+    begins as no such file does.
 
-    Reads no files and imports nothing heavy, so that a mistyped name is reported at once.
+    Imports nothing heavy, so that a wrong file is reported at once.
     """
     for kind, part in parts(config).items():
         check_part(kind, part)
@@ -81,6 +83,10 @@ def check_part(kind: str, part: Named) -> None:
         where = "" if path.is_absolute() else f" in '{Path.cwd()}'"
         raise UserError(f"the {kind} '{path}' does not exist{where}: check its name.")
     _check_suffix(kind, path)
+    if path.suffix.lower() in IMAGE_SUFFIXES:
+        images.check(path)
+    else:
+        heads.check(path)
 
 
 def parts(config: Config) -> dict[str, Named]:

@@ -32,6 +32,7 @@ from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
+from urllib.parse import urlsplit
 
 from styleexp.inputs.asset_table import ASSETS, FOLDERS, KINDS, SUFFIXES, Asset
 from styleexp.system import atomic
@@ -353,7 +354,8 @@ def _download_url(asset: Asset, url: str, scratch: Path) -> Path:
         if not (found := sha256(output_file)).startswith(asset.sha256):
             raise ValueError(f"sha256 {found}, expected {asset.sha256}...")
 
-    log.warning("downloading the %s from %s; this happens only once.", _called(asset), url)
+    host = urlsplit(url).hostname
+    log.warning("downloading the %s from %s; this happens only once.", _called(asset), host)
     pooch.get_logger().setLevel(logging.ERROR)  # its own talk of each try
     shop = pooch.create(
         path=scratch,
@@ -368,7 +370,7 @@ def _download_url(asset: Asset, url: str, scratch: Path) -> Path:
     except (ValueError, OSError) as error:
         # Connection errors list all their retries; the exception type is enough.
         detail = f": {error}" if len(str(error)) < 160 else ""
-        reason = f"{url} failed with {type(error).__name__}{detail}"
+        reason = f"{type(error).__name__}{detail}"
         _cannot_fetch(asset, reason, "check the network, or ", error)
 
 

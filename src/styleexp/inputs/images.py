@@ -42,16 +42,7 @@ def load_image(path: str | Path, *, background: float = 1.0) -> Float[np.ndarray
             Pillow's limit on pixels (``PIL.Image.MAX_IMAGE_PIXELS``).
     """
     path = Path(path)
-    if not path.is_file():
-        what = "is a folder, not an image" if path.is_dir() else "does not exist"
-        raise UserError(f"the image '{path}' {what}.")
-    try:
-        with path.open("rb") as file:
-            head = file.read(1024)
-    except OSError as error:
-        raise UserError(f"the image '{path}' cannot be read: {error.strerror}.") from error
-    if not head:
-        raise UserError(f"the image '{path}' is empty (0 bytes).")
+    head = _head(path)
 
     from PIL import Image, ImageOps, UnidentifiedImageError
 
@@ -198,6 +189,35 @@ def fault_of(image: Image.Image) -> str:
     except Exception:  # as in `load_image`
         return "is damaged or truncated"
     return ""
+
+
+def check(path: Path) -> None:
+    """Raise the `UserError` of a file that `load_image` can't read for its first bytes."""
+    head = _head(path)
+
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        Image.open(path).close()
+    except UnidentifiedImageError as error:
+        if not deep_images.is_tiff(head):
+            raise UserError(f"the image '{path}' {_guess(head)}") from error
+    except Exception:
+        return  # damaged or too large: said by `load_image`
+
+
+def _head(path: Path) -> bytes:
+    if not path.is_file():
+        what = "is a folder, not an image" if path.is_dir() else "does not exist"
+        raise UserError(f"the image '{path}' {what}.")
+    try:
+        with path.open("rb") as file:
+            head = file.read(1024)
+    except OSError as error:
+        raise UserError(f"the image '{path}' cannot be read: {error.strerror}.") from error
+    if not head:
+        raise UserError(f"the image '{path}' is empty (0 bytes).")
+    return head
 
 
 def luminance(rgb: Array) -> Array:

@@ -8,6 +8,7 @@ import numpy as np
 import trimesh
 
 from styleexp.inputs.meshes import joining
+from styleexp.inputs.meshes.heads import NO_FACES
 from styleexp.inputs.meshes.mesh import Carrier, Mesh, face_areas
 from styleexp.system.errors import UserError
 
@@ -50,7 +51,7 @@ def weld(
     points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     if len(carrier.corners) == 0:
         what = "is a point cloud" if len(points) else "contains no mesh"
-        raise UserError(f"{what}: it has no faces; reconstruct or export a surface first.")
+        raise UserError(f"{what}: {NO_FACES}")
     infinite = int((~np.isfinite(points).all(axis=1)).sum())
     if infinite:
         number = plural(infinite, "vertex", "vertices")
