@@ -167,7 +167,7 @@ def test_a_refused_command_costs_no_result_that_is_there(finished, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(finished[0], folder)
     before = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
-    (tmp_path / "junk.obj").write_text("junk")
+    (tmp_path / "junk.obj").write_text("v 0 0 0\nf 1 2 3\n")
     done = command("junk.obj", "bubble", *SMOKE, "hydra.run.dir=run", cwd=tmp_path)
     assert "junk.obj" in complaint(done)
     assert {name: (folder / name).read_bytes() for name in before} == before
@@ -189,7 +189,11 @@ def test_resume_refuses_what_is_no_run(tmp_path):
         (["source=critter"], "no style was given"),
         ([], "no source was given"),
         (["source=critter", "style=bubble", "optim.stps=3"], "optim.steps"),
-        (["source=critter", "style=bubble", "optim.steps=many"], "optim.steps=many"),
+        (
+            ["source=critter", "style=bubble", "optim.steps=many"],
+            "steps must be a whole number, not 'many'",
+        ),
+        (["source=critter", "style=bubble", "style.siz=2"], "only direction, falloff"),
         (["source=critter", "style=bubble", "renderer=kaolin"], "unknown renderer"),
         (["source.path=nowhere.obj", "style=bubble"], "nowhere.obj"),
         (["source=critter", "style.path=nowhere.png"], "nowhere.png"),
@@ -212,13 +216,41 @@ def test_mistakes_get_one_sentence(arguments, expected, tmp_path):
 
 
 def test_failure_is_recorded_with_its_reason(tmp_path):
-    (tmp_path / "empty.obj").touch()
-    arguments = ["source.path=empty.obj", "style=bubble", *SMOKE, "hydra.run.dir=run"]
+    (tmp_path / "torn.obj").write_text("v 0 0 0\nf 1 2 3\n")
+    arguments = ["source.path=torn.obj", "style=bubble", *SMOKE, "hydra.run.dir=run"]
     done = command(*arguments, cwd=tmp_path)
-    assert "empty.obj" in complaint(done)
+    assert "torn.obj" in complaint(done)
     status = json.loads((tmp_path / "run" / "status.json").read_text())
     assert status["status"] == "failed"
-    assert "empty.obj" in status["reason"]
+    assert "torn.obj" in status["reason"]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "expected"),
+    [
+        ("words.obj", "not a mesh at all", "it has no faces"),
+        ("words.glb", "not a mesh at all", "is not a GLB file"),
+        ("empty.stl", "", "is empty"),
+        ("words.png", "not a picture", "is a text file"),
+    ],
+)
+def test_a_file_that_is_none_is_refused_before_anything_heavy_loads(
+    name, content, expected, tmp_path
+):
+    (tmp_path / name).write_text(content)
+    given = ["critter", name] if name.endswith("png") else [name, "bubble"]
+    code = (
+        "import sys\nfrom styleexp.cli.main import main\n"
+        "try: main()\nexcept SystemExit: pass\n"
+        "print([m for m in ('torch', 'trimesh', 'scipy') if m in sys.modules])\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, *given],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert expected in done.stderr
+    assert done.stdout == "[]\n"
+    assert {path.name for path in tmp_path.iterdir()} == {name}
 
 
 def test_unwritable_folder(tmp_path):

@@ -31,6 +31,8 @@ def check(path: Path) -> None:
 
 def _obj(head: bytes, path: Path) -> str:
     """Looks for the first face; a large file's is usually past its first piece."""
+    if b"\0" in head:
+        return ""  # UTF-16, or no text at all: the reader says which
     vertices = False
     with path.open("rb") as file:
         before = b"\n"
@@ -65,7 +67,7 @@ def _glb(head: bytes, path: Path) -> str:
 
 
 def _gltf(head: bytes, path: Path) -> str:
-    known = head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{")
+    known = head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith((b"{", b"["))
     return "" if known else "is not a glTF file: export the mesh again."
 
 

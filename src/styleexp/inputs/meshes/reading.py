@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from styleexp.inputs.meshes import precision, truncation, welding
+from styleexp.inputs.meshes import heads, precision, truncation, welding
 from styleexp.inputs.meshes.gltf import read_gltf
 from styleexp.inputs.meshes.mesh import Carrier, Mesh
 from styleexp.inputs.meshes.obj import read_obj
@@ -56,8 +56,7 @@ def load_mesh(path: str | os.PathLike[str], weld: float | None = None) -> Mesh:
         raise UserError(f"'{path}' is not readable: change the file's permissions.") from None
     except OSError as error:
         raise UserError(f"'{path}' cannot be read ({error.strerror or error}).") from None
-    if not data.strip():
-        raise UserError(f"'{path}' is empty: export the mesh again.")
+    heads.check(path)
     try:
         # Garbage may contain numbers that overflow; `weld` reports them.
         with np.errstate(all="ignore"):
