@@ -71,6 +71,10 @@ def test_a_half_covered_surface_is_told_by_its_regions(bank, ball):
     assert regions["bottom"] > 0.8
     assert regions["top"] < 0.1
     assert set(regions) == set(ratings.REGIONS)
+    asked = (base[:, 1] < 0).astype(float)
+    masked = likeness(bank, Relief(base, faces, height * asked), 1.0, mask=asked)
+    assert masked.coverage > 0.8
+    assert masked.points[:, 1].max() < 0
 
 
 def test_same_seed_same_numbers(bank, ball):
@@ -119,6 +123,9 @@ def test_verdict_names_what_is_bare():
     )
     # Where a style is like noise, nothing can be said of where it is.
     assert ratings.verdict(found(order=0.1)) == "match about 3.1 of 5, craft about 4.2 of 5"
+    assert ratings.verdict(found(masked=0.3)).startswith(
+        "carries the style on 64 % of the part that style.mask selects; match"
+    )
     no_judge = found()
     del no_judge["match"]
     assert ratings.verdict(no_judge) == (

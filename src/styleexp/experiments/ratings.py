@@ -74,7 +74,8 @@ def verdict(found: Mapping[str, float]) -> str | None:
         return rated
     if found["order"] < LEAST_ORDER:
         return f"match about {found['match']:.1f} of 5, {rated}" if "match" in found else rated
-    covered = f"carries the style on {100 * found['coverage']:.0f} % of the surface"
+    of = "the part that style.mask selects" if "masked" in found else "the surface"
+    covered = f"carries the style on {100 * found['coverage']:.0f} % of {of}"
     least = min(REGIONS, key=lambda name: found[f"coverage_{name}"])
     share = found[f"coverage_{least}"]
     if share < found["coverage"] - LESS:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from styleexp.experiments import ratings
 from styleexp.experiments.metrics.likeness import Bank, bank_of, likeness
@@ -24,10 +25,12 @@ from styleexp.experiments.metrics.style import (
     style_distance,
 )
 from styleexp.inputs import meshes
+from styleexp.method import masks
 from styleexp.method.patches import Relief, closest, relief_of_mesh, relief_of_result
 from styleexp.method.subject import Subject, pattern_unit
 from styleexp.method.subject import measure as measure_subject
 from styleexp.method.synthesis.method import exemplar_of_style
+from styleexp.method.synthesis.walk import Sheet
 
 if TYPE_CHECKING:
     import torch
@@ -94,7 +97,8 @@ def measure(
     ``match`` and ``craft`` estimate ratings from 1 to 5 (`ratings`). ``likeness``, 0 to 1, is how
     much of the style the surface carries, and ``order`` how far the style repeats itself;
     ``coverage`` is the share of the surface that carries at least half of the style, of all and of
-    five regions (`metrics.likeness`). ``style_distance`` is 0 for the style itself and 1 for no
+    five regions (`metrics.likeness`); with ``style.mask``, of the part that it selects, the share
+    ``masked`` of the surface. ``style_distance`` is 0 for the style itself and 1 for no
     style at all (`metrics.style`). ``relief_distance`` compares without a neural network.
     ``relief_rms`` is in radii of the normalised source, and ``relief_share`` is its ratio to the
     style mesh's. For the content metrics, see `metrics.shape`.
@@ -105,7 +109,10 @@ def measure(
     bank = bank_for(config, source, style, {} if banks is None else banks, subject)
     if bank is not None:
         base = raised(source, vertices, faces)
-        local = likeness(bank, base, unit)
+        mask = mask_on(config, source, base)
+        local = likeness(bank, base, unit, mask=mask)
+        if mask is not None:
+            found["masked"] = float(np.average(mask, weights=Sheet(base.base, faces).areas))
         found |= {"likeness": float(local.carried.mean()), "order": bank.order}
         found["coverage"] = local.coverage
         found |= {f"coverage_{where}": share for where, share in local.by_region().items()}
@@ -155,6 +162,20 @@ def style_subject(config: Config, source: meshes.Mesh, style: Style) -> Subject:
     return measure_subject(
         plain, source, style, torch.device("cpu"), separate=True, as_tone=as_tone
     )
+
+
+def mask_on(
+    config: Config, source: meshes.Mesh, relief: Relief
+) -> Float[np.ndarray, " vertices"] | None:
+    """``style.mask`` at the relief's vertices, from the source's nearest; None without, or where it
+    nowhere reaches a half."""
+    if config.style.mask is None:
+        return None
+    mask = masks.weights(config.style, source)
+    if len(relief.base) != len(mask):
+        own = meshes.normalisation(source.vertices).apply(source.vertices)
+        mask = mask[cKDTree(own).query(relief.base)[1]]
+    return mask if (mask > 0.5).any() else None
 
 
 def raised(source: meshes.Mesh, vertices: np.ndarray, faces: np.ndarray) -> Relief:

@@ -133,15 +133,22 @@ def _measured(exemplar: Exemplar) -> measured.Arrays:
     return {"slopes": bank.numpy(), "numbers": np.array(numbers)}
 
 
-def likeness(bank: Bank, relief: Relief, unit: float, seed: int = 0) -> Likeness:
-    """Compare a result's relief, whose pattern has the size ``unit``, with the style's patches.
+def likeness(
+    bank: Bank,
+    relief: Relief,
+    unit: float,
+    seed: int = 0,
+    mask: Float[np.ndarray, " vertices"] | None = None,
+) -> Likeness:
+    """Compare a result's relief, whose pattern has the size ``unit``, with the style's patches: on
+    all of its surface, or where ``mask``, 0 to 1, asked for relief.
 
     Undulations of its height longer than `BEND` wavelengths are ignored.
     """
     sheet = Sheet(relief.base, relief.faces)
     wavelength = bank.wavelength * unit
     height = relief.height - smoother(relief.base, relief.faces, BEND * wavelength)(relief.height)
-    patches, start = sample(sheet, height / unit, bank.spacing * unit, seed)
+    patches, start = sample(sheet, height / unit, bank.spacing * unit, seed, mask)
     near = nearest(unit_slopes(patches), bank.slopes)
     alike = (near - bank.chance) / max(bank.own - bank.chance, LEAST_APART)
     high = patches.std(dim=(1, 2)) / max(bank.height, 1e-12)
@@ -149,12 +156,17 @@ def likeness(bank: Bank, relief: Relief, unit: float, seed: int = 0) -> Likeness
 
 
 def sample(
-    sheet: Sheet, height: Float[np.ndarray, " vertices"], spacing: float, seed: int
+    sheet: Sheet,
+    height: Float[np.ndarray, " vertices"],
+    spacing: float,
+    seed: int,
+    mask: Float[np.ndarray, " vertices"] | None = None,
 ) -> tuple[Float[Tensor, "points side side"], np.ndarray]:
-    """Patches around vertices drawn in proportion to their area, in random directions, blurred to
-    the spacing; and these vertices."""
+    """Patches around vertices drawn in proportion to their area, where the mask is above a half, in
+    random directions, blurred to the spacing; and these vertices."""
     rng = np.random.default_rng(seed)
-    start = rng.choice(len(sheet.vertices), POINTS, p=sheet.areas / sheet.areas.sum())
+    share = sheet.areas if mask is None else sheet.areas * (mask > 0.5)
+    start = rng.choice(len(sheet.vertices), POINTS, p=share / share.sum())
     normals = sheet.normals[start]
     ahead = turned(frames(normals)[0], normals, rng.uniform(0, 2 * np.pi, POINTS))
     points, nears, _ = sheet.grids(start, ahead, SIDE, spacing)

@@ -29,6 +29,7 @@ MEANINGS = {
     "craft": "estimate of how raters rate how clean it is, from 1 to 5",
     "likeness": "how much of the style the surface carries, 0 to 1",
     "order": "how far the style repeats itself, 0 to 1",
+    "masked": "share of the surface that style.mask selects; the next are of that part",
     "coverage": "share of the surface that carries at least half of the style",
     "coverage_outer": "the same of the third of the surface that is farthest out",
     "coverage_top": "of the third at the top",
