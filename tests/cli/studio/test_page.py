@@ -140,6 +140,13 @@ def test_from_drop_to_saved_files(studio, given, tmp_path):
         wait(page, f"Number(document.getElementById('stage').dataset.shown) > {looks}")
         wait(page, done)
         time.sleep(1.5)  # the strokes fade
+        painting = pixels(page, "#view-result").astype(int)
+        blue = painting[..., 2] - painting[..., 0] > 40
+        assert blue.mean() > 0.02  # the mask, while one paints
+        page.find_element("id", "paint").click()
+        time.sleep(1.5)
+        plain = pixels(page, "#view-result").astype(int)
+        assert (plain[..., 2] - plain[..., 0] > 40).mean() < 0.001
         # Away from the brush it is a ball again.
         left = np.abs(pixels(page, "#view-result") - before)[:, : before.shape[1] // 3]
         assert left.mean() > 5

@@ -362,7 +362,9 @@ class Workbench:
         assert self._inputs[0] is not None
         frame = meshes.normalisation(self._inputs[0].vertices)
         points = frame.apply(result.vertices)
-        content = glb.glb(points, result.faces, float(np.abs(points).max()), bare=True)
+        mask = result.subject.mask
+        shades = None if mask is None else mask.cpu().numpy() - 1  # blue where it is 0
+        content = glb.glb(points, result.faces, float(np.abs(points).max()), shades, bare=True)
         with self._lock:
             self._check(serial)
             self._made = Made(result, settings, finished, learned)
@@ -372,6 +374,8 @@ class Workbench:
                 result={
                     "vertices": len(result.vertices),
                     "faces": len(result.faces),
+                    "unchanged": result.subject.smooth,
+                    "masked": mask is not None,
                     # Shown positions, times scale, plus center, are those of the source's file.
                     "center": frame.center.tolist(),
                     "scale": frame.scale,

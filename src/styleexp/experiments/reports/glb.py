@@ -47,8 +47,8 @@ def glb(
     """Make a binary glTF 2.0 file.
 
     ``extent`` bounds the magnitude of every coordinate; compared meshes share it, so that equal
-    positions stay equal. ``values`` in [-1, 1] select the heat map's colours. ``bare`` writes only
-    the surface.
+    positions stay equal. ``values`` in [-1, 1] select the heat map's colours. ``bare`` leaves out
+    the edges and, without ``values``, the second surface.
     """
     normals = meshes.vertex_normals(vertices, faces)
     buffer = _Buffer()
@@ -61,7 +61,7 @@ def glb(
     primitives: list[dict[str, Any]] = [surface]
     materials = [_material(CLAY)]
     extra: dict[str, Any] = {}
-    if values is not None and not bare:
+    if values is not None:
         coloured = attributes | {"TEXCOORD_0": buffer.coordinates((values + 1) / 2)}
         primitives.append({"attributes": coloured, "indices": triangles, "material": 1})
         materials.append(_material((1.0, 1.0, 1.0)))

@@ -65,7 +65,7 @@ class Shown:
         reach = max((float(np.abs(shape.vertices).max()) for shape in pair), default=1.0)
         extent = math.ceil(1e4 * reach) / 1e4  # equal for a result read in single precision
         values = heat
-        if heat is None and self.displacement is not None:
+        if heat is None and self.displacement is not None and not bare:
             values = np.clip(self.displacement / (self.reach or 1.0), -1, 1)
         made = {}
         if self.source is not None:

@@ -1,7 +1,7 @@
 (async function () {
   const RANGES = ["strength", "scale", "rotation", "falloff"];
   const root = byId("studio"), shown = {};
-  let state = null, queue = {}, timer = null, gone = false;
+  let state = null, result = null, queue = {}, timer = null, gone = false;
 
   async function ask(path, options) {
     const answer = await fetch(path, options);
@@ -103,7 +103,10 @@
   function paint(on) {
     byId("paint").setAttribute("aria-pressed", String(on));
     strokes.hidden = !on;
+    if (result) show(byId("view-result"), result, nodes());
   }
+  // While one paints, the mask is seen.
+  const nodes = () => [!strokes.hidden && state.result?.masked ? HEAT : SURFACE];
   function touch(event) {
     const viewer = byId("view-result"), box = strokes.getBoundingClientRect();
     const hit = viewer.positionAndNormalFromPoint(event.clientX, event.clientY);
@@ -220,7 +223,10 @@
     root.classList.toggle("failed", state.stage === "failed");
     byId("draft").hidden = !state.result || state.finished || state.learned > 0;
     byId("save").title = state.finished ? "" : "as soon as the result is finished";
-    byId("stage-line").textContent = state.stage === "done" ? (state.finished ? "Done" : "Stopped")
+    const unchanged = state.stage === "done" && state.result?.unchanged;
+    root.classList.toggle("unchanged", unchanged);
+    byId("stage-line").textContent = unchanged ? "Unchanged: this style has no relief"
+      : state.stage === "done" ? (state.finished ? "Done" : "Stopped")
       : state.stage + (/^(preparing|synthesising)/.test(state.stage) && state.detail ? `: ${state.detail}` : "");
     byId("size-line").textContent = state.result ? `${state.result.vertices.toLocaleString()} vertices` +
       (state.learned ? `, ${state.learned} steps learned` : "") : "";
@@ -264,7 +270,8 @@
       if (state.style.picture) byId("picture-style").src = URL.createObjectURL(new Blob([content], { type: "image/png" }));
       else await show(byId("small-style"), content, [SURFACE]);
     } else {
-      await show(byId(`view-${name}`), content, [SURFACE]);
+      if (name === "result") result = content;
+      await show(byId(`view-${name}`), content, name === "result" ? nodes() : [SURFACE]);
       if (name === "source") await show(byId("small-source"), content, [SURFACE]);
       else byId("stage").dataset.shown = String(Number(byId("stage").dataset.shown || 0) + 1);
     }
