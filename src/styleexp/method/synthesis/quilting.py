@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +15,8 @@ from styleexp.method.patches import blurred
 from styleexp.method.synthesis.exemplar import sampled
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Bool, Float, Int
+    from scipy.sparse import csr_matrix
     from torch import Tensor
 
     from styleexp.method.synthesis.exemplar import Exemplar
@@ -33,6 +35,10 @@ MOST_SAMPLES = 3_000_000
 """Maximum number of samples of all pieces together."""
 LABELS = 2
 """Maximum number of pieces per vertex."""
+SWEEPS = 4
+"""Rounds in which every piece is chosen again."""
+LEAST_SEEN = 60
+"""Minimum number of samples that a piece must share with its neighbours to be chosen by them."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +85,8 @@ def quilt(
     choice: int,
 ) -> Quilt:
     """Cover the mesh with pieces of the exemplar, each chosen to match those already placed (after
-    Efros and Freeman 2001; Praun et al. 2000).
+    Efros and Freeman 2001; Praun et al. 2000). Then every piece is chosen again, to match all its
+    neighbours: the last ones close gaps between others that were chosen without them.
 
     The synthesis can preserve, but not find, structures larger than its patches, such as bricks or
     the offset of rows. ``spacing`` is the sample spacing for comparing pieces, ``finest`` that of
@@ -87,26 +94,25 @@ def quilt(
     """
     known, places = sampled(exemplar, choice, SIDE, spacing, (seed,), any_way)
     rng = np.random.default_rng(seed)
-    pieces = known.flatten(1).numpy()
-    squares = pieces**2
+    choices = _Choices(known.flatten(1).numpy())
+    pieces = choices.pieces
     step = spacing * unit
     count = len(sheet.vertices)
-    height, filled = np.zeros(count, np.float32), np.zeros(count, np.float32)
+    height = np.zeros((count, LABELS), np.float32)
     piece = np.full((count, LABELS), -1)
     place, turn = np.zeros((count, LABELS, 2)), np.zeros((count, LABELS, 2))
+    laid: list[_Laid] = []
     for start, grid in _grids(sheet, ahead, step, piece):
         points, nears, carried = grid
         sample = sheet.interpolation(points, nears)
-        seen = (sample @ filled > 0.99) & (sheet.normals[nears] @ sheet.normals[start] > SAME_WAY)
-        if seen.any():
-            here = seen.astype(np.float32)
-            best = int((squares @ here - 2 * pieces @ (here * (sample @ height))).argmin())
-        else:
+        facing = sheet.normals[nears] @ sheet.normals[start] > SAME_WAY
+        best = choices.nearest(sample, facing, height[:, 0], piece[:, 0] >= 0)
+        if best is None:
             best = int(rng.integers(len(pieces)))
         reach = 0.75 * SIDE * step
         around = np.asarray(sheet.tree.query_ball_point(sheet.vertices[start], reach))
-        facing = sheet.normals[around] @ sheet.normals[start] > SAME_WAY
-        around = around[facing & (piece[around, -1] < 0)]
+        alike = sheet.normals[around] @ sheet.normals[start] > SAME_WAY
+        around = around[alike & (piece[around, -1] < 0)]
         away, cell = cKDTree(points).query(sheet.vertices[around], distance_upper_bound=step)
         on = np.isfinite(away)
         around, cell = around[on], cell[on]
@@ -122,9 +128,9 @@ def quilt(
         piece[around, label] = best
         place[around, label] = np.stack([down, right], axis=1)
         turn[around, label] = both / np.linalg.norm(both, axis=1, keepdims=True).clip(min=1e-9)
-        new = label == 0
-        height[around[new]] = pieces[best, cell[new]]
-        filled[around[new]] = 1
+        height[around, label] = pieces[best, cell]
+        laid.append(_Laid(sample, facing, around, cell, label))
+    _rechosen(laid, choices, height, piece)
     _completed(sheet, piece, place, turn)
     used, piece = np.unique(piece, return_inverse=True)
     samples = SIDE + 2 * MARGIN
@@ -138,6 +144,71 @@ def quilt(
         torch.from_numpy(place).float(),
         torch.from_numpy(turn).float(),
     )
+
+
+@dataclass(frozen=True)
+class _Choices:
+    """The pieces to choose from."""
+
+    pieces: Float[np.ndarray, "pieces cells"]
+
+    @cached_property
+    def _squares(self) -> Float[np.ndarray, "pieces cells"]:
+        return self.pieces**2
+
+    def nearest(
+        self,
+        sample: csr_matrix,
+        facing: Bool[np.ndarray, " cells"],
+        height: Float[np.ndarray, " vertices"],
+        known: Bool[np.ndarray, " vertices"],
+        least: int = 1,
+    ) -> int | None:
+        """The piece nearest to the heights where they are known, in at least so many cells, else
+        None."""
+        seen = (sample @ known.astype(np.float32) > 0.99) & facing
+        if seen.sum() < least:
+            return None
+        here = seen.astype(np.float32)
+        return int((self._squares @ here - 2 * self.pieces @ (here * (sample @ height))).argmin())
+
+
+@dataclass(frozen=True)
+class _Laid:
+    """A piece on the mesh."""
+
+    sample: csr_matrix
+    """Samples vertex values at its cells."""
+    facing: Bool[np.ndarray, " cells"]
+    around: Int[np.ndarray, " covered"]
+    """The vertices that it covers, their cells, and which of their labels it is."""
+    cell: Int[np.ndarray, " covered"]
+    label: Int[np.ndarray, " covered"]
+
+
+def _rechosen(
+    laid: list[_Laid],
+    choices: _Choices,
+    height: Float[np.ndarray, "vertices labels"],
+    piece: Int[np.ndarray, "vertices labels"],
+) -> None:
+    """Choose every piece again to match the others where they overlap, in place."""
+    shown, known = height[:, 0].copy(), piece[:, 0] >= 0
+    for _ in range(SWEEPS):
+        changed = False
+        for each in laid:
+            around, cell, label = each.around, each.cell, each.label
+            own = around[label == 0]
+            # Without this piece its vertices show their second label's.
+            shown[own], known[own] = height[own, 1], piece[own, 1] >= 0
+            best = choices.nearest(each.sample, each.facing, shown, known, LEAST_SEEN)
+            if best is not None and len(around):
+                changed |= bool(piece[around[0], label[0]] != best)
+                piece[around, label] = best
+                height[around, label] = choices.pieces[best, cell]
+            shown[own], known[own] = height[own, 0], True
+        if not changed:
+            break
 
 
 def _grids(
