@@ -259,6 +259,8 @@ def _keep(asking: int, out: int, err: int) -> dict[str, Any]:
             _, status = os.waitpid(forked, 0)
             told.sendall(str(os.waitstatus_to_exitcode(status)).encode())
             os._exit(0)
+    # A shell's background job, as pytest may be, has its children ignore Ctrl-C.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     if asked["session"]:
         os.setsid()
     for end, number in ((out, 1), (err, 2)):
