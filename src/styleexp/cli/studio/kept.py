@@ -51,11 +51,11 @@ class Kept:
             self._kept[name] = kept = (key, make())
         return kept[1]
 
-    def source(self, settings: Settings) -> tuple[meshes.Mesh, Style]:
-        """The source and the style as read."""
+    def source(self, settings: Settings, more: tuple[str, ...] = ()) -> tuple[meshes.Mesh, Style]:
+        """The source and the style as read. ``more`` are the overrides of what is made next."""
 
         def named() -> Any:
-            config = self._config(settings, [])
+            config = self._config(settings, [*settings.overrides, *more])
             sources.check(config)
             return config
 
@@ -66,10 +66,12 @@ class Kept:
         )
 
     @contextmanager
-    def given(self, settings: Settings) -> Iterator[tuple[Callable[..., Any], Any]]:
+    def given(
+        self, settings: Settings, more: tuple[str, ...] = ()
+    ) -> Iterator[tuple[Callable[..., Any], Any]]:
         """Within it, source and style aren't read again. Yields a function from further overrides
         to a configuration, and these two."""
-        mesh, style = self.source(settings)
+        mesh, style = self.source(settings, more)
         given = style.mesh if style.mesh is not None else style.picture
         assert given is not None
 

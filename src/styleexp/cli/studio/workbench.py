@@ -272,7 +272,10 @@ class Workbench:
     def _synthesise(self, settings: Settings, serial: int, more: tuple[str, ...]) -> None:
         draft = bool(more)
         name = "a draft" if draft else "the relief"
-        with self._at(serial, f"preparing {name}"), self._kept.given(settings) as (config, load):
+        with (
+            self._at(serial, f"preparing {name}"),
+            self._kept.given(settings, more) as (config, load),
+        ):
             method = build.method_of(config(more))
             assert isinstance(method, synthesis.Synthesis)
             subject = self._kept.subject(settings, more, config, load)
