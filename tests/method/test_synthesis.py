@@ -14,10 +14,11 @@ from styleexp.config.compose import compose
 from styleexp.inputs import meshes, shapes, spheres
 from styleexp.method import scene
 from styleexp.method.patches import relief_of_mesh
+from styleexp.method.relief import heat_smoother, smoother
 from styleexp.method.synthesis import method as synthesis
 from styleexp.method.synthesis.direction import FLOW, UP, direction_field, turned
 from styleexp.method.synthesis.exemplar import MeshExemplar, PictureExemplar, measure
-from styleexp.method.synthesis.optimise import bank, matched
+from styleexp.method.synthesis.optimise import DISORDERED, bank, matched
 from styleexp.method.synthesis.quilting import quilt
 from styleexp.method.synthesis.room import ball_radius
 from styleexp.method.synthesis.shape import exemplar_of
@@ -147,7 +148,7 @@ def test_patches_of_a_picture_are_its_parts():
 def test_the_nearest_patch_is_the_nearest():
     """As a search through all of them says, with the weights that the bank compares with."""
     made = torch.rand(300, 9, 9, generator=torch.Generator().manual_seed(1))
-    known = bank(made)
+    known = bank(made, 100.0 * np.arange(300)[:, None], 1.0)
     wanted = torch.tensor([5, 17, 200])
     best, misfit = known.nearest(made.flatten(1)[wanted] + 1e-3)
     assert best.tolist() == wanted.tolist()
@@ -156,7 +157,7 @@ def test_the_nearest_patch_is_the_nearest():
 
 def test_the_nearest_among_the_like_is_found_from_one_of_them():
     made = torch.rand(300, 9, 9, generator=torch.Generator().manual_seed(1))
-    known = bank(made)
+    known = bank(made, 100.0 * np.arange(300)[:, None], 1.0)
     before = known.similar[:, 3]  # each patch's third neighbour
     grids = made.flatten(1)
     best, misfit = known.nearer(grids, before)
@@ -311,3 +312,30 @@ def test_a_direction_that_is_asked_for_is_followed_by_a_pattern_without_one():
     assert not synthesis.any_way(build.subject_of(config, True), directed=True)
     config = compose(["source=sphere", "style=bubble", "method=synthesis", "style.direction=up"])
     assert not synthesis.any_way(build.subject_of(config, True), directed=False)
+
+
+def test_smoothing_leaves_a_slope_alone_on_uneven_triangles(plane):
+    """The graph Laplacian drew ripples on every slope, along the mesh's own rows."""
+    rng = np.random.default_rng(0)
+    vertices = plane.vertices + [0.01, 0.01, 0] * rng.uniform(-1, 1, plane.vertices.shape)
+    inside = np.abs(vertices).max(axis=1) < 0.7
+    slope = vertices[:, 0]
+    moved = {
+        way: np.abs(way(vertices, plane.faces, 1.5 * plane.edge)(slope) - slope)[inside].max()
+        for way in (heat_smoother, smoother)
+    }
+    assert moved[heat_smoother] < 1e-4 < 1e-3 < moved[smoother]
+
+
+def test_a_pattern_without_order_is_told_from_a_regular_one():
+    """Votes of patches that disagree made a blur of gravel; its quilt is left as it is."""
+    noise = np.random.default_rng(0).normal(size=(512, 512))
+    pebbles = gaussian_filter(noise, 2.0, mode="wrap")
+    waves = np.sin(np.arange(512) * 2 * np.pi / 16)[:, None] * np.ones(512)
+    measured = []
+    for height in (waves, pebbles):
+        exemplar = PictureExemplar(torch.from_numpy(height).float(), 1 / 64)
+        rng = np.random.default_rng(0)
+        patches, places = exemplar.sample(4000, 9, 3 / 64, rng, any_way=False)
+        measured.append(bank(patches, exemplar.centres(places), 3 / 64).disorder)
+    assert measured[0] < 0.1 * DISORDERED < 2 * DISORDERED < measured[1]

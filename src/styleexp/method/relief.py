@@ -60,6 +60,35 @@ def smoother(
     return smooth
 
 
+def heat_smoother(
+    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"], length: float
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Like `smoother`, by an implicit step of heat flow with the cotangent Laplacian: on the flat
+    it keeps linear functions whatever the triangles, where the graph Laplacian leaves ripples."""
+    import gpytoolbox
+    from scipy.sparse import diags
+    from scipy.sparse.linalg import cg
+
+    count = len(vertices)
+    laplacian = gpytoolbox.cotangent_laplacian(vertices, faces)
+    laplacian.data = np.nan_to_num(laplacian.data, posinf=0.0, neginf=0.0)  # from zero-area faces
+    corners = vertices[faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    third = np.linalg.norm(cross, axis=1) / 6
+    area = np.bincount(faces.ravel(), np.repeat(third, 3), minlength=count)
+    mass = area.clip(min=1e-9 * area.mean())
+    time = 4 * (length / (2 * np.pi)) ** 2
+    matrix = (diags(mass) + time * laplacian).tocsr()
+    inverse = diags(1 / matrix.diagonal())
+
+    def smooth(values: np.ndarray) -> np.ndarray:
+        columns = np.asarray(values, dtype=np.float64).reshape(count, -1).T
+        found = [cg(matrix, mass * each, each, rtol=1e-8, M=inverse)[0] for each in columns]
+        return np.stack(found, axis=1).reshape(np.shape(values))
+
+    return smooth
+
+
 def half_range(height: Float[np.ndarray, " vertices"]) -> float:
     """Half the distance between the 1st and the 99th percentile."""
     low, high = np.percentile(height, [1, 99])

@@ -16,7 +16,7 @@ from torch.nn import functional
 
 from styleexp.inputs import measured
 from styleexp.method.patches import blurred
-from styleexp.method.relief import mesh_frequency, smoother
+from styleexp.method.relief import heat_smoother, mesh_frequency
 from styleexp.method.synthesis.direction import UP, direction_field, turned
 from styleexp.method.synthesis.walk import Sheet
 
@@ -159,7 +159,7 @@ class MeshExemplar:
             seen &= self.usual[nears]
         height = self.height
         if spacing > 1.5 * sheet.edge:
-            height = smoother(sheet.vertices, sheet.faces, 2 * spacing)(height)
+            height = heat_smoother(sheet.vertices, sheet.faces, 2 * spacing)(height)
         sampling = sheet.interpolation(points.reshape(-1, 3), nears.ravel())
         sampled = sampling @ height.astype(np.float32)
         return torch.from_numpy(sampled).float().view(-1, side, side), seen.mean(axis=(1, 2))

@@ -17,11 +17,11 @@ from styleexp.method import height_maps
 from styleexp.method.base import Method, Result, Scene, displaced
 from styleexp.method.fields import zero_mean
 from styleexp.method.masks import masked
-from styleexp.method.relief import half_range, mesh_relief, smoother
+from styleexp.method.relief import half_range, heat_smoother, mesh_relief
 from styleexp.method.surface import unfolded
 from styleexp.method.synthesis.direction import FLOW, UP, direction_field, turned
 from styleexp.method.synthesis.exemplar import MeshExemplar, Pattern, PictureExemplar, pattern_of
-from styleexp.method.synthesis.optimise import Level, synthesise
+from styleexp.method.synthesis.optimise import ROUNDS, synthesise
 from styleexp.method.synthesis.room import ball_radius
 from styleexp.method.synthesis.walk import Sheet
 from styleexp.system.progress import doing, tell
@@ -45,8 +45,7 @@ a patch at this spacing; coarser patches would smooth it away."""
 COARSEST = 0.06
 """Maximum sample spacing, in units of the pattern; larger quilt pieces fit on few parts of a
 mesh."""
-ROUNDS = (10, 6, 3)
-"""Rounds per level, from coarse to fine."""
+MOST_LEVELS = 5
 EVEN = 1.5
 """Smoothing length in edges; removes finer relief, which would turn steep walls into sawteeth."""
 ROOM = 0.6
@@ -123,7 +122,7 @@ def heights(
     ahead = directions(subject, begun.sheet, begun.directed)
     levels = levels_of(begun.pattern, begun.sheet.edge / subject.unit)
     tell(summary(subject, begun.pattern, begun.directed, levels))
-    total = sum(level.rounds for level in levels)
+    total = ROUNDS * len(levels)
     found = synthesise(
         begun.sheet, ahead, begun.exemplar, levels, subject.unit, any_way(subject, begun.directed),
         subject.settings.optim.seed, most=config.bank,
@@ -144,7 +143,7 @@ def displacement(
     """Heights as displacements, scaled by ``strength``, in radii of the normalised source: faded
     where there is no room, with zero mean over the surface."""
     sheet = begun.sheet
-    even = smoother(sheet.vertices, sheet.faces, EVEN * sheet.edge)
+    even = heat_smoother(sheet.vertices, sheet.faces, EVEN * sheet.edge)
     moved = torch.from_numpy(even(height.numpy())) * subject.unit * strength
     moved *= torch.from_numpy(fade(sheet, half_range(moved.numpy())))
     if config.flatten:
@@ -185,16 +184,15 @@ def exemplar_of_style(subject: Subject) -> MeshExemplar | PictureExemplar:
     return PictureExemplar(tile.height.cpu() * (subject.relief / subject.unit), pixel)
 
 
-def levels_of(pattern: Pattern, edge: float) -> list[Level]:
-    """Levels with spacings from the pattern's wavelength down to the mesh's edge length (in units
-    of the pattern), halved from level to level."""
+def levels_of(pattern: Pattern, edge: float) -> list[float]:
+    """Sample spacings from the pattern's wavelength down to the mesh's edge length (in units of
+    the pattern), halved from level to level."""
     coarsest = min(pattern.wavelength / PER_WAVE, COARSEST)
-    spacings = [coarsest / 2**number for number in range(len(ROUNDS))]
-    carried = [each for each in spacings[1:] if each >= 0.8 * edge]
-    return [Level(*each) for each in zip([coarsest, *carried], ROUNDS, strict=False)]
+    spacings = [coarsest / 2**number for number in range(MOST_LEVELS)]
+    return [spacings[0], *(each for each in spacings[1:] if each >= 0.8 * edge)]
 
 
-def summary(subject: Subject, pattern: Pattern, directed: bool, levels: list[Level]) -> str:
+def summary(subject: Subject, pattern: Pattern, directed: bool, levels: list[float]) -> str:
     """One-line summary of the style's measurements."""
     name = subject.style.name
     return (
@@ -210,4 +208,4 @@ def fade(sheet: Sheet, height: float) -> Float[np.ndarray, " vertices"]:
     reach = 2 * height / ROOM
     room = np.minimum(ball_radius(sheet, -1, reach), ball_radius(sheet, 1, reach))
     factor = (ROOM * room / max(height, 1e-12)).clip(0, 1)
-    return smoother(sheet.vertices, sheet.faces, 4 * height + sheet.edge)(factor).clip(0, 1)
+    return heat_smoother(sheet.vertices, sheet.faces, 4 * height + sheet.edge)(factor).clip(0, 1)

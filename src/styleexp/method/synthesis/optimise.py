@@ -23,8 +23,12 @@ if TYPE_CHECKING:
 
     from styleexp.method.synthesis.exemplar import Exemplar
 
+ROUNDS = 3
+"""Rounds per level."""
 COMPONENTS = 24
 """Number of principal components for comparing patches."""
+MEASURED = 500
+"""Number of patches used to measure a bank's noise."""
 SAMPLES = 40_000
 """Number of exemplar heights used to estimate their distribution."""
 MOST_GAIN = 1.5
@@ -39,26 +43,20 @@ DENSITY, FINE_DENSITY = 0.8, 1.3
 VOTE = 0.2
 """Standard deviation of a patch's Gaussian weights, relative to its side."""
 KEEP, KEEP_FINE = 4.0, 1.0
-"""The quilt's own patch is kept while its misfit times this factor is below that of the best patch.
-The first applies to the first level, where seams are repaired: the quilt, with its seams, matches
-itself."""
+"""The quilt's own patch is kept while its misfit times this factor is below that of the best patch,
+plus `Bank.noise`. The first applies to the first level, where seams are repaired: the quilt, with
+its seams, matches itself."""
 AT_ONCE = 256
 """Grids compared with the whole bank per batch, so that the distances fit a cache."""
+DISORDERED = 0.1
+"""`Bank.disorder` above which a level that isn't the last is skipped: 0.13 to 0.28 for circles,
+cracks, wool, bark and gravel, at most 0.07 for bricks, waves and whatever is regular."""
 CHOICE = 0.3
 """Number of quilt pieces to choose from, per patch of a bank."""
 SIMILAR = 12
 """Number of patches, similar to the previous best one, to compare instead of the whole bank."""
 TRUST = 0.6
 """A patch's vote is weighted by its misfit to the power of minus this."""
-
-
-@dataclass(frozen=True)
-class Level:
-    """One scale of the synthesis."""
-
-    spacing: float
-    """Sample spacing of a patch, in units of the pattern."""
-    rounds: int
 
 
 @dataclass(frozen=True)
@@ -70,6 +68,17 @@ class Bank:
     basis: Float[Tensor, "cells components"]
     """Maps a mean-free patch to its comparison features; the centre counts more than the rim."""
     reduced: Float[Tensor, "patches components"]
+    noise: float
+    """Median squared distance of a patch to the one most similar to it elsewhere on the exemplar:
+    how well any patch of it can be matched. Where no two are alike, as in gravel, the nearest is a
+    blurred one."""
+
+    @property
+    def disorder(self) -> float:
+        """`noise` relative to the mean squared distance of two patches."""
+        half = len(self.reduced) // 2
+        pairs = self.reduced[:half] - self.reduced[half : 2 * half]
+        return self.noise / max(float(pairs.square().sum(1).mean()), 1e-20)
 
     @property
     def middles(self) -> Float[Tensor, " patches"]:
@@ -121,8 +130,12 @@ class Bank:
         return torch.cat(best), torch.cat(least)
 
 
-def bank(patches: Float[Tensor, "patches side side"]) -> Bank:
-    """Build a bank from patches."""
+def bank(
+    patches: Float[Tensor, "patches side side"],
+    centres: Float[np.ndarray, "patches axes"],
+    spacing: float,
+) -> Bank:
+    """Build a bank from patches with these centres and sample spacing."""
     side = patches.shape[1]
     flat = patches.flatten(1)
     mean = flat.mean(0)
@@ -131,14 +144,22 @@ def bank(patches: Float[Tensor, "patches side side"]) -> Bank:
     some = weighted[:: max(1, len(flat) // 4000)]
     directions = torch.linalg.svd(some, full_matrices=False)[2][:COMPONENTS].T
     basis = weight[:, None] * directions
-    return Bank(flat, mean, basis, (flat - mean) @ basis)
+    reduced = (flat - mean) @ basis
+    step = max(1, len(flat) // MEASURED)
+    away = torch.cdist(reduced[::step], reduced).square()
+    where = torch.from_numpy(centres).float()
+    away[torch.cdist(where[::step], where) < side * spacing / 2] = torch.inf
+    least = away.min(dim=1).values
+    seen = least[least.isfinite()]  # all of a tiny exemplar may be near
+    noise = float(seen.median()) if len(seen) else 0.0
+    return Bank(flat, mean, basis, reduced, noise)
 
 
 def synthesise(
     sheet: Sheet,
     ahead: Float[np.ndarray, "vertices 3"],
     exemplar: Exemplar,
-    levels: list[Level],
+    spacings: list[float],
     unit: float,
     any_way: bool,
     seed: int,
@@ -147,34 +168,39 @@ def synthesise(
     """Yield the vertices' heights, in units of the pattern, after every round, with its number;
     that of the quilt, from which the first round starts, is 0.
 
-    ``ahead`` is the direction of the pattern's up, ``unit`` the length of a pattern unit on the
-    mesh, ``most`` the maximum size of a level's bank.
+    ``ahead`` is the direction of the pattern's up, ``spacings`` are those of a patch's samples at
+    each level, from coarse to fine, in units of the pattern, ``unit`` is the length of such a unit
+    on the mesh, ``most`` the maximum size of a level's bank.
     """
     doing("covering the source with pieces of the style")
-    first, last = levels[0], levels[-1]
     choice = round(CHOICE * most)
-    laid = quilt(sheet, ahead, exemplar, first.spacing, last.spacing, unit, any_way, seed, choice)
+    laid = quilt(sheet, ahead, exemplar, spacings[0], spacings[-1], unit, any_way, seed, choice)
     height = laid.heights()
     done = 0
     yield done, height
     rng = np.random.default_rng(seed)
-    for number, level in enumerate(levels, 1):
-        fine = level is last and level is not first
+    for number, spacing in enumerate(spacings, 1):
+        first, fine = number == 1, 1 < number == len(spacings)
         side, density = (FINE_SIDE, FINE_DENSITY) if fine else (SIDE, DENSITY)
         weight = _gaussian(side, VOTE)
         doing("taking patches of the style")
-        known = bank(sampled(exemplar, most, side, level.spacing, (seed, number), any_way)[0])
-        middle = sheet.spread(density * level.spacing * unit, rng)
-        sample = sheet.sampling(middle, ahead[middle], side, level.spacing * unit)
+        patches, places = sampled(exemplar, most, side, spacing, (seed, number), any_way)
+        known = bank(patches, exemplar.centres(places), spacing)
+        if number < len(spacings) and known.disorder > DISORDERED:
+            done += ROUNDS
+            continue  # no patch fits its neighbours better than the quilt's
+        middle = sheet.spread(density * spacing * unit, rng)
+        sample = sheet.sampling(middle, ahead[middle], side, spacing * unit)
         spread = sample.T
-        quilted = laid.patches(torch.from_numpy(middle), side, level.spacing)
+        quilted = laid.patches(torch.from_numpy(middle), side, spacing)
         compared = known.compared(quilted)
         best: Tensor | None = None
-        for _ in range(level.rounds):
+        for _ in range(ROUNDS):
             grids = _apply(sample, height).view(len(middle), -1)
             best, misfit = known.nearest(grids) if best is None else known.nearer(grids, best)
             own = (compared - known.compared(grids)[:, None]).square().sum(2).min(dim=1)
-            kept = (KEEP if level is first else KEEP_FINE) * own.values < misfit
+            factor = KEEP if first else KEEP_FINE
+            kept = factor * own.values < misfit + known.noise
             misfit = torch.where(kept, own.values, misfit)
             stays = quilted[torch.arange(len(middle)), own.indices]
             chosen = torch.where(kept[:, None], stays, known.patches[best])

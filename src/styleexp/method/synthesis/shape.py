@@ -11,12 +11,11 @@ from scipy.ndimage import (
     gaussian_filter,
     map_coordinates,
 )
-from scipy.sparse import coo_matrix, diags
+from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import cg
 
 from styleexp.inputs import measured, meshes
-from styleexp.method.relief import smoother
+from styleexp.method.relief import heat_smoother, smoother
 from styleexp.method.synthesis.exemplar import MeshExemplar
 from styleexp.method.synthesis.walk import Sheet
 from styleexp.system.errors import UserError
@@ -107,21 +106,10 @@ def _smoothed(
 ) -> list[tuple[Sheet, Float[np.ndarray, " vertices"]]]:
     """The surface smoothed by each length, and the heights above it. The Laplacian is cotangent,
     not the graph Laplacian, so that a non-uniform mesh of a smooth ball has no relief."""
-    import gpytoolbox
-
     vertices = mesh.vertices
-    laplacian = gpytoolbox.cotangent_laplacian(vertices, mesh.faces)
-    laplacian.data = np.nan_to_num(laplacian.data, posinf=0.0, neginf=0.0)  # from zero-area faces
-    area = Sheet(vertices, mesh.faces).areas
-    mass = area.clip(min=1e-9 * area.mean())
     parted = []
     for length in lengths:
-        # Damps a wave of this length to a fifth, like `relief.smoother`.
-        time = 4 * (length / (2 * np.pi)) ** 2
-        matrix = (diags(mass) + time * laplacian).tocsr()
-        inverse = diags(1 / matrix.diagonal())
-        columns = [cg(matrix, mass * each, each, rtol=1e-8, M=inverse)[0] for each in vertices.T]
-        base = np.stack(columns, axis=1)
+        base = heat_smoother(vertices, mesh.faces, length)(vertices)
         normals = meshes.vertex_normals(base, mesh.faces)
         height = ((vertices - base) * normals).sum(axis=1)
         # Smoothing also moves vertices sideways, off steep walls; the height must stay below its
