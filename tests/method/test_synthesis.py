@@ -282,20 +282,6 @@ def test_learning_can_start_at_the_synthesis(coarse_shapes):
     assert np.allclose(base.numpy() * subject.frame.scale, made.displacement, atol=1e-6)
 
 
-def test_flatten_takes_the_sources_own_bumps_off_as_far_as_the_relief_is_high():
-    bumpy = shapes.make("wave_small", detail=6000)
-    given = (bumpy, "stripe", "baseline.bank=500", "source.refine=none", "field.unfold=false")
-    plain, flat = (styleexp.stylize(*given, f"baseline.flatten={share}") for share in (0, 1))
-    bumps = np.linalg.norm(bumpy.vertices, axis=1)
-    taken = flat.displacement - plain.displacement
-    assert np.corrcoef(taken, bumps)[0, 1] < -0.9
-    assert np.abs(taken).max() < 2.2 * np.abs(plain.displacement).max()
-    with pytest.raises(
-        UserError, match=r"baseline.flatten=2.0 is not allowed: give a value from 0 to 1\."
-    ):
-        styleexp.stylize(*given, "baseline.flatten=2")
-
-
 @pytest.mark.parametrize(("length", "directed"), [(1, False), (4, True)])
 def test_long_forms_have_a_direction_though_they_have_no_spacing(length, directed):
     noise = np.random.default_rng(0).normal(size=(300, 300))

@@ -88,6 +88,7 @@ UNNAMED: dict[str, dict[str, Any]] = {
 REMOVED: dict[str, dict[str, Any]] = {
     "encoder": {"pooling": "max"},
     "shading": {"light_spread": 0.0},
+    "baseline": {"flatten": 0.0},
 }
 """Options that old records have and this version doesn't, with the value that had no effect."""
 

@@ -28,9 +28,6 @@ class SynthesisConfig:
     name: str = "synthesis"
     bank: int = option(10_000, between=(500, 200_000))
     """Number of patches sampled from the style at each scale."""
-    flatten: float = option(0.0, between=(0, 1))
-    """Fraction of the source's own relief to remove, 0 to 1, at scales as fine as the pattern: for
-    a source whose bumps hide the pattern."""
 
 
 @dataclass

@@ -17,7 +17,7 @@ from styleexp.method import height_maps
 from styleexp.method.base import Method, Result, Scene, displaced
 from styleexp.method.fields import zero_mean
 from styleexp.method.masks import masked
-from styleexp.method.relief import half_range, heat_smoother, mesh_relief
+from styleexp.method.relief import half_range, heat_smoother
 from styleexp.method.surface import unfolded
 from styleexp.method.synthesis.direction import FLOW, UP, direction_field, turned
 from styleexp.method.synthesis.exemplar import MeshExemplar, Pattern, PictureExemplar, pattern_of
@@ -71,7 +71,7 @@ class Synthesis(Method[Scene]):
 
     def laid(self, subject: Subject, begun: Begun, height: Float[Tensor, " vertices"]) -> Result:
         """Displace the source by these heights; see `heights`."""
-        found = displacement(subject, begun, height, self.config, subject.settings.strength)
+        found = displacement(subject, begun, height, subject.settings.strength)
         found = masked(found, subject.mask)
         if subject.settings.field.unfold:
             found = unfolded(subject.surface, found)
@@ -99,7 +99,7 @@ def relief(
     normalised source, with zero mean over the surface."""
     begun = begin(subject)
     height = deque(heights(subject, begun, config), maxlen=1).pop()
-    return displacement(subject, begun, height, config, strength)
+    return displacement(subject, begun, height, strength)
 
 
 def begin(subject: Subject) -> Begun:
@@ -137,7 +137,6 @@ def displacement(
     subject: Subject,
     begun: Begun,
     height: Float[Tensor, " vertices"],
-    config: SynthesisConfig,
     strength: float,
 ) -> Float[Tensor, " vertices"]:
     """Heights as displacements, scaled by ``strength``, in radii of the normalised source: faded
@@ -146,11 +145,6 @@ def displacement(
     even = heat_smoother(sheet.vertices, sheet.faces, EVEN * sheet.edge)
     moved = torch.from_numpy(even(height.numpy())) * subject.unit * strength
     moved *= torch.from_numpy(fade(sheet, half_range(moved.numpy())))
-    if config.flatten:
-        wavelength = begun.pattern.wavelength * subject.unit
-        own = mesh_relief(sheet.vertices, sheet.faces, sheet.normals, wavelength)
-        most = float(moved.abs().max())
-        moved -= config.flatten * torch.from_numpy(own.clip(-most, most))
     moved = zero_mean(moved, subject.weights.cpu().double(), math.inf)
     return moved.to(subject.surface.vertices.device)
 
