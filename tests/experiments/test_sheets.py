@@ -77,11 +77,12 @@ def test_catch_trials_show_what_the_key_says(out):
     assert np.array_equal(source, result)
     _, (source, _, result) = columns(out, key, "result")
     assert np.abs(source - result).mean() > 0.5
-    # The style of another run, beside a result that some other sheet shows with its own.
+    # The style of another run, beside a result that some other sheet shows with its own: from other
+    # sides there, or raters recognise it.
     shown, (_, style, result) = columns(out, key, "other style")
     own = next(n for n, s in key.items() if s["run"] == shown["run"] and s["trial"] == "result")
     picture = np.asarray(Image.open(out / "sheets" / f"{own}.png"), dtype=float)[30:]
-    assert np.array_equal(picture[:, 2 * sheets.SIZE :], result)
+    assert np.abs(picture[:, 2 * sheets.SIZE :] - result).mean() > 0.5
     assert np.abs(picture[:, sheets.SIZE : 2 * sheets.SIZE] - style).mean() > 0.5
 
 

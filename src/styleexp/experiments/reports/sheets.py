@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 SCHEMA = "styleexp-sheets-1"
 VIEWS = ((15.0, 35.0), (20.0, 215.0))
 """(elevation, azimuth) in degrees: from the front left, and from behind on the right."""
+QUARTER = 90.0
+"""Turn of the views of a result beside another style, in degrees, so that it isn't recognised from
+its own sheet."""
 SIZE = 480
 """Side of each view, in pixels."""
 RESULTS_PER_CATCH = 12
@@ -108,11 +111,12 @@ def drawn(sheet: Sheet) -> Image.Image:
     assert own.source is not None
     assert own.result is not None
     result = own.source if sheet.trial == "source" else own.result
+    turn = QUARTER if sheet.trial == "other style" else 0.0
     frame = np.concatenate([own.source.vertices, own.result.vertices])
     columns = [
-        ("source", _views(own.source, frame)),
+        ("source", _views(own.source, frame, turn)),
         ("style", _style(beside.style)),
-        ("result", _views(result, frame)),
+        ("result", _views(result, frame, turn)),
     ]
     band = 30
     picture = Image.new("L", (len(columns) * SIZE, band + len(VIEWS) * SIZE), 255)
@@ -156,8 +160,9 @@ def _read(run: Run) -> Shown:
     return shown
 
 
-def _views(shape: Shape, frame: np.ndarray) -> list[Image.Image]:
-    elevations, azimuths = ([view[k] for view in VIEWS] for k in (0, 1))
+def _views(shape: Shape, frame: np.ndarray, turn: float = 0.0) -> list[Image.Image]:
+    elevations = [elevation for elevation, _ in VIEWS]
+    azimuths = [azimuth + turn for _, azimuth in VIEWS]
     pictures = render_views(shape.vertices, shape.faces, elevations, azimuths, SIZE, frame=frame)
     return [Image.fromarray(picture) for picture in pictures]
 
