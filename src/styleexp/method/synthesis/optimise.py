@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -48,9 +47,9 @@ plus `Bank.noise`. The first applies to the first level, where seams are repaire
 its seams, matches itself."""
 AT_ONCE = 256
 """Grids compared with the whole bank per batch, so that the distances fit a cache."""
-DISORDERED = 0.1
-"""`Bank.disorder` above which a level that isn't the last is skipped: 0.13 to 0.28 for circles,
-cracks, wool, bark and gravel, at most 0.07 for bricks, waves and whatever is regular."""
+DISORDERED = 0.18
+"""`Bank.disorder` above which a level that isn't the last is skipped: 0.21 to 0.28 for terrain,
+bark, grass and gravel; 0.13 to 0.15 for circles, wool and cracks, less for what is regular."""
 CHOICE = 0.3
 """Number of quilt pieces to choose from, per patch of a bank."""
 SIMILAR = 12
@@ -85,43 +84,51 @@ class Bank:
         """Heights at the patch centres."""
         return self.patches[:, self.patches.shape[1] // 2]
 
-    def nearest(self, grids: Float[Tensor, "grids cells"]) -> tuple[Tensor, Tensor]:
-        """For each grid, the most similar patch and the squared distance to it."""
-        best, least = self._search(self.compared(grids), 1)
-        return best[:, 0], least[:, 0]
-
     def compared(self, patches: Float[Tensor, "... cells"]) -> Float[Tensor, "... components"]:
         """Comparison features of patches."""
         return (patches - self.mean) @ self.basis
 
+    def nearest(self, features: Float[Tensor, "grids components"]) -> tuple[Tensor, Tensor]:
+        """For each grid, the most similar patch and the squared distance to it."""
+        best, least = self._search(features, 1)
+        return best[:, 0], least[:, 0]
+
+    def found(
+        self, features: Float[Tensor, "grids components"], before: Int[Tensor, " grids"]
+    ) -> tuple[Tensor, Tensor]:
+        """`nearest` where nothing was found ``before``, which is -1 there, else `nearer`."""
+        new = before < 0
+        best, least = torch.empty_like(before), features.new_empty(len(before))
+        best[new], least[new] = self.nearest(features[new])
+        best[~new], least[~new] = self.nearer(features[~new], before[~new])
+        return best, least
+
     def nearer(
-        self, grids: Float[Tensor, "grids cells"], before: Int[Tensor, " grids"]
+        self, features: Float[Tensor, "grids components"], before: Int[Tensor, " grids"]
     ) -> tuple[Tensor, Tensor]:
         """Like `nearest`, among the patches similar to that found ``before``. A round changes a
         grid little, and this takes a tenth of the time."""
-        reduced = self.compared(grids)
+        known, place = before.unique(return_inverse=True)
+        similar = self.similar(known)
         best, least = [], []
-        for at in range(0, len(grids), 16 * AT_ONCE):
-            some = slice(at, at + 16 * AT_ONCE)
-            candidates = self.similar[before[some]]
-            away = (self.reduced[candidates] - reduced[some, None]).square().sum(2).min(dim=1)
+        for some, at in zip(features.split(16 * AT_ONCE), place.split(16 * AT_ONCE), strict=True):
+            candidates = similar[at]
+            away = (self.reduced[candidates] - some[:, None]).square().sum(2).min(dim=1)
             best.append(candidates.gather(1, away.indices[:, None])[:, 0])
             least.append(away.values)
         return torch.cat(best), torch.cat(least)
 
-    @cached_property
-    def similar(self) -> Int[Tensor, "patches similar"]:
-        """For each patch, the most similar ones, including itself."""
-        return self._search(self.reduced, min(SIMILAR, len(self.reduced)))[0]
+    def similar(self, some: Int[Tensor, " some"]) -> Int[Tensor, "some similar"]:
+        """For these patches, the most similar ones, including themselves."""
+        return self._search(self.reduced[some], min(SIMILAR, len(self.reduced)))[0]
 
     def _search(
-        self, reduced: Float[Tensor, "grids components"], count: int
+        self, features: Float[Tensor, "grids components"], count: int
     ) -> tuple[Int[Tensor, "grids count"], Float[Tensor, "grids count"]]:
         """The ``count`` nearest patches for each query, and the squared distances."""
         own = self.reduced.square().sum(1)
         best, least = [], []
-        for at in range(0, len(reduced), AT_ONCE):
-            some = reduced[at : at + AT_ONCE]
+        for some in features.split(AT_ONCE):
             away = torch.addmm(own[None], some, self.reduced.T, alpha=-2)
             # A minimum is ten times as fast as the smallest few.
             found = away.min(1, True) if count == 1 else away.topk(count, 1, largest=False)
@@ -194,16 +201,18 @@ def synthesise(
         spread = sample.T
         quilted = laid.patches(torch.from_numpy(middle), side, spacing)
         compared = known.compared(quilted)
-        best: Tensor | None = None
+        factor = KEEP if first else KEEP_FINE
+        best = torch.full((len(middle),), -1)
         for _ in range(ROUNDS):
-            grids = _apply(sample, height).view(len(middle), -1)
-            best, misfit = known.nearest(grids) if best is None else known.nearer(grids, best)
-            own = (compared - known.compared(grids)[:, None]).square().sum(2).min(dim=1)
-            factor = KEEP if first else KEEP_FINE
-            kept = factor * own.values < misfit + known.noise
-            misfit = torch.where(kept, own.values, misfit)
-            stays = quilted[torch.arange(len(middle)), own.indices]
-            chosen = torch.where(kept[:, None], stays, known.patches[best])
+            features = known.compared(_apply(sample, height).view(len(middle), -1))
+            own = (compared - features[:, None]).square().sum(2).min(dim=1)
+            misfit, chosen = own.values, quilted[torch.arange(len(middle)), own.indices]
+            # Where the quilt fits as well as anything can, there is no need to search.
+            at = (factor * misfit >= known.noise).nonzero()[:, 0]
+            best[at], least = known.found(features[at], best[at])
+            better = factor * misfit[at] >= least + known.noise
+            at, least = at[better], least[better]
+            misfit[at], chosen[at] = least, known.patches[best[at]]
             trust = (misfit + 0.02 * misfit.mean() + 1e-12) ** -TRUST
             say = weight * trust[:, None]
             total = _apply(spread, (chosen * say).flatten())
