@@ -13,8 +13,10 @@ from styleexp.config import build
 from styleexp.config.compose import compose
 from styleexp.inputs import meshes, shapes, spheres
 from styleexp.method import scene
+from styleexp.method.options import StyleConfig
 from styleexp.method.patches import relief_of_mesh
 from styleexp.method.relief import heat_smoother, smoother
+from styleexp.method.subject import Style, pattern_unit
 from styleexp.method.synthesis import method as synthesis
 from styleexp.method.synthesis.direction import FLOW, UP, direction_field, turned
 from styleexp.method.synthesis.exemplar import MeshExemplar, PictureExemplar, measure
@@ -273,6 +275,22 @@ def test_strength_zero_gives_the_source_back_and_no_face_turns_over(striped):
 def test_what_can_not_be_laid_is_said_in_one_sentence(style, options, told):
     with pytest.raises(UserError, match=told):
         styleexp.stylize("torus", style, *CHEAP, *options)
+
+
+def test_a_pattern_is_finer_where_the_source_has_thin_parts():
+    """Bumps as thick as a leg don't look like a pattern."""
+    style = Style.of(shapes.make("bubble"))
+    wanted = {
+        "critter": 0.5,
+        "sphere": 1.0,
+    }  # critter's solidity is 0.49, the least that counts 0.5
+    for name, filled in wanted.items():
+        source = shapes.make(name)
+        of = {by: pattern_unit(StyleConfig(scale_by=by), source, style) for by in ("area", "parts")}
+        assert of["parts"] / of["area"] == pytest.approx(filled**0.5, rel=0.01)
+    picture = Style.of(np.random.default_rng(0).uniform(size=(32, 32, 3)), "picture")
+    of = [pattern_unit(StyleConfig(scale_by=by), source, picture) for by in ("area", "parts")]
+    assert of[0] == of[1]
 
 
 def test_learning_can_start_at_the_synthesis(coarse_shapes):

@@ -35,6 +35,10 @@ PICTURE_STEEPNESS = 0.15
 """Assumed half range of an image's relief, in wavelengths, since an image doesn't determine its
 height. The analytic styles have 0.10 to 0.16."""
 
+LEAST_FILLED = 0.5
+"""Minimum fraction of its convex hull that counts as filled by the source, for the pattern's size
+(``style.scale_by=parts``)."""
+
 PICTURE_DETAIL = 128
 """Longer side, in pixels, at which an image's frequency is measured; finer detail is ignored."""
 
@@ -198,8 +202,13 @@ def pattern_unit(config: StyleConfig, source: meshes.Mesh, style: Style) -> floa
     if config.scale_by == "frame":
         return config.scale
     sphere = math.sqrt(4 * math.pi)
-    unit = 1.0 if style.mesh is None else normalised_size(style.mesh) / sphere
-    return config.scale * normalised_size(source) / sphere / unit
+    if style.mesh is None:
+        return config.scale * normalised_size(source) / sphere
+    unit = config.scale * normalised_size(source) / normalised_size(style.mesh)
+    if config.scale_by == "parts":
+        filled = meshes.solidity(source.vertices, source.faces)
+        unit *= math.sqrt(max(filled, LEAST_FILLED))
+    return unit
 
 
 def choose_field(
