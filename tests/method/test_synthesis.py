@@ -280,10 +280,7 @@ def test_what_can_not_be_laid_is_said_in_one_sentence(style, options, told):
 def test_a_pattern_is_finer_where_the_source_has_thin_parts():
     """Bumps as thick as a leg don't look like a pattern."""
     style = Style.of(shapes.make("bubble"))
-    wanted = {
-        "critter": 0.5,
-        "sphere": 1.0,
-    }  # critter's solidity is 0.49, the least that counts 0.5
+    wanted = {"critter": 0.5, "sphere": 1.0}  # critter fills 0.49; 0.5 is the least that counts
     for name, filled in wanted.items():
         source = shapes.make(name)
         of = {by: pattern_unit(StyleConfig(scale_by=by), source, style) for by in ("area", "parts")}
@@ -296,7 +293,8 @@ def test_a_pattern_is_finer_where_the_source_has_thin_parts():
 def test_learning_can_start_at_the_synthesis(coarse_shapes):
     """Before the first step it is what ``method=synthesis`` makes."""
     made = styleexp.stylize("torus", "stripe", "source.refine=none", "field.unfold=false")
-    config = compose(["method=robust", "source=torus", "style=stripe", "field.start=synthesis"])
+    given = ["source=torus", "style=stripe", "style.scale_by=parts"]
+    config = compose(["method=robust", "field.start=synthesis", *given])
     subject = build.subject_of(config, separate=True)
     base, notes = scene.base_of(subject)
     assert not notes
