@@ -13,6 +13,15 @@ UNFIT = re.compile(
 )
 """OmegaConf's message for a value of another type."""
 WANTED = {"Float": "a number", "Integer": "a whole number", "bool": "true or false"}
+SEVERAL = re.compile(r"Ambiguous value for argument '([^'=]+)=([^\n]*)'")
+"""Hydra's message for several values without ``-m``."""
+UNADDED = re.compile(
+    r"Could not override '([^'=]+)'[^\n]*\n*(?:Did you mean[^\n]*\n*)?"
+    r"To append to your default list use \+([^\n]*)"
+)
+"""Hydra's message for a group that is chosen with ``+``."""
+FOLDER = ("out", "output", "outdir", "out_dir", "output_dir", "dir", "folder", "run_dir")
+"""What people take the run's folder for."""
 HYDRA_PLUGINS = {"hydra/launcher": "sweep", "hydra/sweeper": "search"}
 """Config groups provided by Hydra plugins, and the extra that installs them."""
 
@@ -42,6 +51,14 @@ def explain(error: BaseException) -> str:
                 f"Hydra's plugin '{choice[2]}' is not installed: pip install 'styleexp[{extra}]'."
             )
         return str(unknown_name(choice[1], choice[2], _options(choice[1])))
+    if several := SEVERAL.search(text):
+        key, values = several.groups()
+        return (
+            f"{key} has several values, {values}: add -m to run each of them, or give one (a list "
+            f"is {key}=[{values}])."
+        )
+    if unadded := UNADDED.search(text):
+        return f"{unadded[1]} is not part of every run: add it with a plus, +{unadded[2].strip()}."
     unknown = re.search(r"Key '(\w+)' (?:is )?not in", text)
     if unknown:
         from styleexp.config.schema import Config
@@ -53,6 +70,8 @@ def explain(error: BaseException) -> str:
             known = own or known
         near = difflib.get_close_matches(unknown[1], [k.split(".")[-1] for k in known], n=1)
         meant = [k for k in known if near and k.split(".")[-1] == near[0]]
+        if unknown[1] in FOLDER:
+            meant = ["hydra.run.dir"]
         hint = f"did you mean {' or '.join(dict.fromkeys(meant))}? " if meant else ""
         if full and not meant:
             of_it = ", ".join(sorted(dict.fromkeys(k.removeprefix(f"{section}.") for k in known)))
