@@ -77,7 +77,7 @@ def test_any_text_comes_through_hydra_and_its_sweeper(first, second):
         assert OmegaConf.create({"path": value}).path == text
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(TEXT)
 def test_a_file_of_any_name_is_found(tmp_path_factory, text):
     name = f"{text}.obj"
