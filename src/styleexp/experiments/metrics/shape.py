@@ -149,7 +149,7 @@ def self_intersections(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray
 def _near_pairs(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pairs (i < j) of triangles (n, 3, 3) with overlapping bounding boxes, found with a grid."""
     low, high = triangles.min(axis=1), triangles.max(axis=1)
-    cell = max(float(np.percentile((high - low).max(axis=1), 95)), 1e-12)
+    cell = max(float(np.percentile((high - low).max(axis=1), 75)), 1e-12)
     first, last = (np.floor(x / cell).astype(np.int64) for x in (low, high))
     # A face far larger than the rest would span too many cells: test it against all others.
     large = np.flatnonzero((last - first).max(axis=1) > LARGE)
@@ -186,8 +186,9 @@ def _near_pairs(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     one = np.concatenate([owner[left], np.repeat(large, [len(m) for m in meets])])
     other = np.concatenate([owner[right], *meets])
     overlap = ((low[one] <= high[other]) & (low[other] <= high[one])).all(axis=1)
-    pairs = np.unique(np.sort(np.stack([one[overlap], other[overlap]], axis=1), axis=1), axis=0)
-    return pairs[:, 0], pairs[:, 1]
+    one, other = one[overlap], other[overlap]
+    keys = np.sort(np.minimum(one, other) * len(low) + np.maximum(one, other))
+    return np.divmod(keys[np.diff(keys, prepend=-1) > 0], len(low))
 
 
 def _edges_cut(a: np.ndarray, b: np.ndarray) -> np.ndarray:
