@@ -17,7 +17,7 @@ from styleexp.experiments.metrics.board import nearest
 from styleexp.inputs import meshes, shapes
 from styleexp.inputs.style import Style
 from styleexp.method import patches
-from styleexp.method.subject import pattern_unit
+from styleexp.method.pattern_size import pattern_unit
 
 DETAIL = 6_000
 

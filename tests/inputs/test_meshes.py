@@ -115,20 +115,6 @@ def test_normalisation_and_back():
         meshes.normalisation(np.ones((4, 3)))
 
 
-def test_solidity_is_the_share_of_the_convex_hull_that_is_filled():
-    ball = trimesh.creation.icosphere(3)
-    assert meshes.solidity(ball.vertices, ball.faces) == pytest.approx(1)
-    ring = trimesh.creation.annulus(r_min=0.5, r_max=1.0, height=0.3, sections=64)
-    filled = meshes.solidity(ring.vertices + 7.0, ring.faces)  # wherever it is
-    assert filled == pytest.approx(0.75, abs=1e-6)
-    torn = ball.faces[2:]  # a small hole is closed
-    assert meshes.solidity(ball.vertices, torn) == pytest.approx(1, abs=0.01)
-    upper = ball.faces[ball.triangles_center[:, 1] > 0]
-    assert meshes.solidity(ball.vertices, upper) == 1
-    flat = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    assert meshes.solidity(flat, np.array([[0, 1, 2], [0, 2, 1]])) == 1
-
-
 def test_vertex_normals_are_area_weighted_and_always_finite():
     # A flat square of unequal triangles, one without area, and a vertex that no face uses.
     vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [5, 5, 5]], dtype=float)

@@ -17,8 +17,7 @@ from styleexp.config.overrides import understood
 from styleexp.inputs import meshes
 from styleexp.method import masks
 from styleexp.method.options import StyleConfig
-from styleexp.method.synthesis.method import directions
-from styleexp.method.synthesis.walk import Sheet
+from styleexp.method.synthesis.method import begin, directions
 from styleexp.runs import identity, origins
 from styleexp.system.errors import UserError
 from tests.helpers import warm
@@ -247,9 +246,9 @@ def test_a_direction_of_the_file_is_followed_and_turned():
         asked = ("style.direction=attribute:way", f"style.rotation={rotation}")
         with sources.given(source=given):
             subject = build.subject_of(compose([*options, *asked]))
-        surface = subject.surface
-        sheet = Sheet(surface.vertices.numpy(), given.faces, surface.normals.numpy())
-        ahead.append(directions(subject, sheet, directed=True))
+        begun = begin(subject)
+        ahead.append(directions(subject, begun))
+    sheet = begun.sheet
     wish = around(sheet.vertices)
     wish /= np.linalg.norm(wish, axis=1, keepdims=True).clip(1e-9)
     there = np.abs(sheet.vertices[:, 0]) < 0.9

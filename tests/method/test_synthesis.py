@@ -15,8 +15,9 @@ from styleexp.inputs import meshes, shapes, spheres
 from styleexp.method import scene
 from styleexp.method.options import StyleConfig
 from styleexp.method.patches import relief_of_mesh
+from styleexp.method.pattern_size import MOST_GROWN, pattern_unit, thickness
 from styleexp.method.relief import heat_smoother, smoother
-from styleexp.method.subject import Style, pattern_unit
+from styleexp.method.subject import Style
 from styleexp.method.synthesis import method as synthesis
 from styleexp.method.synthesis.direction import FLOW, UP, direction_field, turned
 from styleexp.method.synthesis.exemplar import MeshExemplar, PictureExemplar, measure
@@ -280,14 +281,54 @@ def test_what_can_not_be_laid_is_said_in_one_sentence(style, options, told):
 def test_a_pattern_is_finer_where_the_source_has_thin_parts():
     """Bumps as thick as a leg don't look like a pattern."""
     style = Style.of(shapes.make("bubble"))
-    wanted = {"critter": 0.5, "sphere": 1.0}  # critter fills 0.49; 0.5 is the least that counts
-    for name, filled in wanted.items():
-        source = shapes.make(name)
-        of = {by: pattern_unit(StyleConfig(scale_by=by), source, style) for by in ("area", "parts")}
-        assert of["parts"] / of["area"] == pytest.approx(filled**0.5, rel=0.01)
-    picture = Style.of(np.random.default_rng(0).uniform(size=(32, 32, 3)), "picture")
-    of = [pattern_unit(StyleConfig(scale_by=by), source, picture) for by in ("area", "parts")]
-    assert of[0] == of[1]
+
+    def factor(source, style, **more):
+        by = {by: StyleConfig(scale_by=by, **more) for by in ("area", "parts")}
+        unit = {each: pattern_unit(config, source, style) for each, config in by.items()}
+        return unit["parts"] / unit["area"]
+
+    ball = shapes.make("sphere")
+    assert thickness(ball) == pytest.approx(2, rel=0.02)
+    rod = trimesh.creation.capsule(3.0, 0.2)
+    rod = meshes.Mesh("rod", np.array(rod.vertices), np.array(rod.faces))
+    assert thickness(rod) == pytest.approx(0.4 / 1.7, rel=0.05)
+    assert factor(ball, style) == pytest.approx(1, abs=0.03)
+    assert factor(rod, style) < 0.9
+    assert factor(rod, style, scale=2.0) == factor(rod, style)  # what is asked for is exact
+    turned = trimesh.transformations.random_rotation_matrix(np.full(3, 0.4))[:3, :3]
+    moved = meshes.Mesh("rod", 3 * rod.vertices @ turned.T + 5, rod.faces)
+    assert factor(moved, style) == pytest.approx(factor(rod, style), rel=1e-3)
+    flat = shapes.make("terrain")  # has no inside
+    assert thickness(flat) == 2
+
+
+def test_a_picture_is_large_enough_for_its_detail():
+    """Blades of grass narrower than a few faces are lumps."""
+    noise = np.random.default_rng(0).normal(size=(512, 512))
+    source = shapes.make("sphere")
+    size = {}
+    for width in (1, 12):
+        tone = gaussian_filter(noise, width, mode="wrap")
+        style = Style.of(np.repeat((tone - tone.min())[..., None], 3, 2) / np.ptp(tone), "picture")
+        size[width] = pattern_unit(StyleConfig(scale_by="parts"), source, style)
+    assert size[12] < 1.05 < size[1] <= MOST_GROWN
+
+
+def test_bumps_of_the_source_give_way_to_the_pattern_and_its_form_stays():
+    ball = trimesh.creation.icosphere(5)
+    base = np.array(ball.vertices)
+    bumps = 0.01 * np.sin(20 * base).prod(axis=1)
+    bent = 0.1 * base[:, 1] ** 2
+    vertices = base * (1 + bumps + bent)[:, None]
+    sheet = Sheet(vertices, np.array(ball.faces))
+    own = synthesis.own_relief(sheet, 0.6, 0.02)
+    assert np.corrcoef(own, bumps)[0, 1] > 0.8
+    assert own.std() > 0.6 * bumps.std()
+    sheet = Sheet(base * (1 + bent)[:, None], np.array(ball.faces))
+    assert np.abs(synthesis.own_relief(sheet, 0.6, 0.02)).max() < 0.05 * np.ptp(bent)
+    assert not synthesis.own_relief(sheet, 0.6, 0.0).any()
+    needle = Sheet(vertices * [0.1, 1.0, 0.1], np.array(ball.faces))  # thinner than the bumps
+    assert np.abs(synthesis.own_relief(needle, 0.6, 0.02)).max() < 1e-3
 
 
 def test_learning_can_start_at_the_synthesis(coarse_shapes):

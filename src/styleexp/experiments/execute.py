@@ -392,7 +392,10 @@ def _write_results(
     size, frames = config.preview.resolution, config.preview.turntable_frames
     folder.write("preview.png", lambda path: previews.write_preview(result, size, path))
     folder.write("turntable.gif", lambda path: previews.write_turntable(result, frames, size, path))
-    names = ("preview.png", "turntable.gif", *meshes)
+    names = ["preview.png", "turntable.gif", *meshes]
+    if result.directions is not None:
+        folder.write("direction.png", lambda path: previews.write_directions(result, size, path))
+        names.insert(2, "direction.png")
     written = [folder.path / name for name in names]
     doing("measuring the result")
     measured = measure(result)

@@ -84,6 +84,9 @@ class Result:
     """Signed displacement along the source's normals, in the source's own units."""
     vertices: Float[np.ndarray, "vertices 3"]
     """Positions in the source's own frame."""
+    directions: Float[np.ndarray, "vertices 3"] | None = None
+    """Unit tangent to the source at each vertex along which the pattern's up was laid, for a method
+    that lays it (``direction.png``)."""
 
     @property
     def faces(self) -> Int[np.ndarray, "faces 3"]:

@@ -25,10 +25,10 @@ class StyleConfig:
     """Scale of the pattern on the result: 2 doubles the size of its features."""
     scale_by: str = option("area", choices=("area", "parts", "frame"))
     """Meaning of ``scale=1``. ``area``: the result has as many features as the style mesh; lengths
-    scale with the square root of the surface area. ``parts``: the same, but smaller by the square
-    root of the fraction of its convex hull that the source fills, so that a pattern doesn't become
-    as thick as legs; a picture as by ``area``. ``frame``: both meshes fill the unit sphere, as
-    in the paper, and an image fills the views unless ``loss.target=bank``."""
+    scale with the square root of the surface area. ``parts``: the same, but finer on a thin source,
+    so that a pattern doesn't become as thick as legs (see `pattern_size.finer`); a picture is at
+    least so large that 200,000 faces can carry its detail. ``frame``: both meshes fill the unit
+    sphere, as in the paper, and an image fills the views unless ``loss.target=bank``."""
     direction: str = "auto"
     """Direction of the pattern's up axis (``method=synthesis``). ``up``, ``x``, ``y``, ``z``: along
     that axis where the surface allows (``up`` is ``y``). ``flow``: smoothly along the form.

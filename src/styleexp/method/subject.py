@@ -12,11 +12,12 @@ import torch
 from styleexp.inputs import meshes
 from styleexp.inputs.images import is_normal_map
 from styleexp.inputs.style import Style
-from styleexp.method import masks, pictures
+from styleexp.method import masks, pattern_size, pictures
 from styleexp.method.pictures import Heights
 from styleexp.method.refinement import refined
 from styleexp.method.relief import half_range, mesh_frequency, mesh_relief, picture_frequency
 from styleexp.method.surface import Surface, normalised, vertex_areas
+from styleexp.method.synthesis.exemplar import MeshExemplar
 from styleexp.system.errors import UserError
 from styleexp.system.progress import doing
 
@@ -25,19 +26,14 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from styleexp.method.options import FieldConfig, Settings, StyleConfig
-    from styleexp.method.synthesis.exemplar import MeshExemplar
 
 
 BOUND_MARGIN = 2.0
 """Displacement bound as a multiple of the style's own relief."""
 
-PICTURE_STEEPNESS = 0.15
+PICTURE_STEEPNESS = 0.2
 """Assumed half range of an image's relief, in wavelengths, since an image doesn't determine its
-height. The analytic styles have 0.10 to 0.16."""
-
-LEAST_FILLED = 0.5
-"""Minimum fraction of its convex hull that counts as filled by the source, for the pattern's size
-(``style.scale_by=parts``)."""
+height. The analytic styles have 0.10 to 0.16, on whose finest detail less depends."""
 
 PICTURE_DETAIL = 128
 """Longer side, in pixels, at which an image's frequency is measured; finer detail is ignored."""
@@ -58,7 +54,7 @@ class Subject:
     surface: Surface
     areas: Float[Tensor, " vertices"]
     unit: float
-    """Size of a unit pattern on the normalised source; see `pattern_unit`."""
+    """Size of a unit pattern on the normalised source; see `pattern_size`."""
     sigma: float
     """Standard deviation of the Fourier frequencies, in cycles per radius of the normalised
     source."""
@@ -110,18 +106,18 @@ def measure(
     masks.check(settings.style, source)
     doing(f"measuring the source ({len(source.faces):,} faces) and the style")
     heights = heights_of(settings.style, style, as_tone)
-    unit = pattern_unit(settings.style, source, style)
+    unit = pattern_size.pattern_unit(settings.style, source, style)
     sigma, bound, height = choose_field(settings.field, style, heights, settings.style.image_tile)
     size = 1.0 if settings.style.scale_by == "frame" else unit
     example, smooth = None, False
-    if separate and style.mesh is not None:
-        from styleexp.method.synthesis.shape import exemplar_of
-
+    if separate:
         doing("separating the style's relief from its shape")
-        example = exemplar_of(style.mesh, settings.style.relief_length)
-        smooth = example is None
-        if example is not None and settings.field.sigma is None:
-            sigma = min(max(example.frequency, 1.0), 10.0)
+        found = pattern_size.example_of(settings.style, style)
+        smooth = found is None
+        if found is not None and settings.field.sigma is None:
+            sigma = min(max(found.frequency, 1.0), 10.0)
+        if isinstance(found, MeshExemplar):
+            example = found
     if heights is not None and heights.in_proportion:
         side = pictures.picture_side(settings.style, unit)
         height = pictures.spread(heights.height) * side / size
@@ -192,23 +188,6 @@ def placed(
     mask = torch.from_numpy(masks.weights(config, source)).to(areas)
     share = float((areas * mask).sum() / areas.sum())
     return mask, [f"the relief covers {100 * share:.1f} % of the surface (style.mask)"]
-
-
-def pattern_unit(config: StyleConfig, source: meshes.Mesh, style: Style) -> float:
-    """Size of a unit pattern on the normalised source; see ``StyleConfig.scale_by``.
-
-    An image is treated as covering the unit sphere.
-    """
-    if config.scale_by == "frame":
-        return config.scale
-    sphere = math.sqrt(4 * math.pi)
-    if style.mesh is None:
-        return config.scale * normalised_size(source) / sphere
-    unit = config.scale * normalised_size(source) / normalised_size(style.mesh)
-    if config.scale_by == "parts":
-        filled = meshes.solidity(source.vertices, source.faces)
-        unit *= math.sqrt(max(filled, LEAST_FILLED))
-    return unit
 
 
 def choose_field(
@@ -290,9 +269,3 @@ def stray_faces(what: str, mesh: meshes.Mesh) -> list[str]:
         f"(the first has index {first}, at {x:.4g}, {y:.4g}, {z:.4g}): delete them in a mesh "
         f"editor, or the rest fills only {100 * bulk / distance.max():.0f} % of every view."
     ]
-
-
-def normalised_size(mesh: meshes.Mesh) -> float:
-    """Square root of the mesh's area in the unit sphere."""
-    area = meshes.face_areas(mesh.vertices, mesh.faces).sum()
-    return math.sqrt(area) / meshes.normalisation(mesh.vertices).scale

@@ -1,4 +1,5 @@
-"""Pictures of a finished run: ``preview.png`` and ``turntable.gif``. Not used in optimisation.
+"""Pictures of a finished run: ``preview.png``, ``turntable.gif`` and, of a pattern that was laid
+along directions, ``direction.png``. Not used in optimisation.
 
 ``preview=pyrender`` adds a check view: the result drawn by an independent renderer in another
 process, so that faults of the training renderer can't go unnoticed.
@@ -25,13 +26,13 @@ from PIL import Image, ImageDraw, ImageFont
 
 from styleexp.inputs import meshes
 from styleexp.method.views import orbit, zoom
-from styleexp.renderers.base import Cameras, Renderer, Shading
+from styleexp.renderers.base import Cameras, Renderer, RenderOutput, Shading
 from styleexp.renderers.soft_raster import SoftRaster
 from styleexp.runs.pyrender_view import UNAVAILABLE
 from styleexp.system.errors import UserError
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Int
 
     from styleexp.config.schema import Config
     from styleexp.method.base import Result
@@ -47,6 +48,10 @@ VIEWS = (
 SUPERSAMPLING = 2
 LIGHT = (0.35, 0.45, 0.62)
 """Light direction in camera space, from above right, so that relief is shaded."""
+
+DART = 0.07
+"""Distance between the darts that show the pattern's directions, in radii."""
+DIRECTED = "the pattern's up, on the source"
 
 CHECK_PLATFORMS = ("egl", "osmesa")
 """Headless OpenGL platforms for pyrender, in order of preference."""
@@ -67,20 +72,34 @@ def render_views(
 ) -> np.ndarray:
     """Render a mesh in the unit sphere as 8-bit grey (views, size, size), tightly framed: itself,
     or all points of ``frame``, to show several meshes at one size."""
-    shading = Shading(albedo=0.8, ambient=0.22, light=LIGHT, background=1.0, normals="smooth")
     points = torch.from_numpy(np.ascontiguousarray(vertices)).float()
     within = points if frame is None else torch.from_numpy(np.ascontiguousarray(frame)).float()
     cameras = framed(within, elevations, azimuths)
-    large = size * SUPERSAMPLING
+    return shrunk(render(vertices, faces, cameras, size * SUPERSAMPLING, device).image)
+
+
+def render(
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: np.ndarray,
+    cameras: Cameras,
+    size: int,
+    device: torch.device | str,
+) -> RenderOutput:
+    """Render a mesh for people to look at."""
+    shading = Shading(albedo=0.8, ambient=0.22, light=LIGHT, background=1.0, normals="smooth")
     with torch.no_grad():
-        out = SoftRaster().render(
-            points.to(device),
+        return SoftRaster().render(
+            torch.from_numpy(np.ascontiguousarray(vertices)).float().to(device),
             torch.from_numpy(np.ascontiguousarray(faces)).to(device),
             cameras,
             shading,
-            (large, large),
+            (size, size),
         )
-        small = torch.nn.functional.avg_pool2d(out.image.permute(0, 3, 1, 2), SUPERSAMPLING)
+
+
+def shrunk(image: Float[torch.Tensor, "views large large 1"]) -> np.ndarray:
+    """Images as 8-bit grey (views, size, size), `SUPERSAMPLING` times smaller."""
+    small = torch.nn.functional.avg_pool2d(image.permute(0, 3, 1, 2), SUPERSAMPLING)
     return (small[:, 0].clamp(0, 1) * 255).round().byte().cpu().numpy()
 
 
@@ -120,6 +139,44 @@ def write_preview(result: Result, size: int, path: Path) -> None:
     generated = subject.frame.apply(result.vertices)
     rows.append(("result", shown(generated, subject.source.faces)))
     sheet(rows, size).save(path)
+
+
+def write_directions(result: Result, size: int, path: Path) -> None:
+    """Draw which way the pattern was laid, four views of ``size`` pixels: darts on the source that
+    point to the pattern's up."""
+    assert result.directions is not None
+    subject = result.subject
+    source, faces = subject.frame.apply(subject.source.vertices), subject.source.faces
+    normals = subject.surface.normals.double().cpu().numpy()
+    points, darts = dart_mesh(source, normals, result.directions)
+    elevations, azimuths = [v[1] for v in VIEWS], [v[2] for v in VIEWS]
+    out = render(
+        np.concatenate([source, points]),
+        np.concatenate([faces, len(source) + darts]),
+        framed(torch.from_numpy(source).float(), elevations, azimuths),
+        size * SUPERSAMPLING,
+        subject.surface.vertices.device,
+    )
+    assert out.face_ids is not None
+    dart = (out.face_ids >= len(faces))[..., None]
+    pictures = shrunk(torch.where(dart, 0.0, 0.4 + 0.6 * out.image))
+    sheet([(DIRECTED, [Image.fromarray(p) for p in pictures])], size).save(path)
+
+
+def dart_mesh(
+    vertices: Float[np.ndarray, "vertices 3"],
+    normals: Float[np.ndarray, "vertices 3"],
+    directions: Float[np.ndarray, "vertices 3"],
+) -> tuple[Float[np.ndarray, "points 3"], Int[np.ndarray, "darts 3"]]:
+    """Thin triangles just above the mesh, at vertices `DART` apart, pointing along their
+    directions."""
+    cells = np.floor(vertices / DART).astype(np.int64)
+    some = np.sort(np.unique(cells, axis=0, return_index=True)[1])
+    place = vertices[some] + 0.2 * DART * normals[some]
+    along = 0.45 * DART * directions[some]
+    aside = 0.35 * np.cross(normals[some], along)
+    corners = [place + along, place - along + aside, place - along - aside]
+    return np.stack(corners, axis=1).reshape(-1, 3), np.arange(3 * len(some)).reshape(-1, 3)
 
 
 def write_turntable(result: Result, frames: int, size: int, path: Path) -> None:

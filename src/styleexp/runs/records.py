@@ -41,6 +41,7 @@ FILES = (
     "result.3mf",
     "preview.png",
     "turntable.gif",
+    "direction.png",
     "check.png",
     "check.gif",
     "check.json",

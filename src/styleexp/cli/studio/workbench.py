@@ -286,7 +286,8 @@ class Workbench:
             begun = self._kept.begun(settings, more, subject)
             height, last = self._kept.heights_for(settings, more), 0.0
             if height is None:
-                rounds = synthesis.heights(subject, begun, method.config)
+                ahead = synthesis.directions(subject, begun)
+                rounds = synthesis.heights(subject, begun, ahead, method.config)
                 for height in rounds:
                     self._check(serial)
                     if time.monotonic() - last > OFTEN:

@@ -27,7 +27,8 @@ from styleexp.experiments.metrics.style import (
 from styleexp.inputs import meshes
 from styleexp.method import masks
 from styleexp.method.patches import Relief, closest, relief_of_mesh, relief_of_result
-from styleexp.method.subject import Subject, pattern_unit
+from styleexp.method.pattern_size import pattern_unit
+from styleexp.method.subject import Subject
 from styleexp.method.subject import measure as measure_subject
 from styleexp.method.synthesis.method import exemplar_of_style
 from styleexp.method.synthesis.walk import Sheet

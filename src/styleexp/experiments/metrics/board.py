@@ -15,7 +15,7 @@ from styleexp.experiments.metrics.style import Looks, pattern_distance, relief_d
 from styleexp.inputs import meshes
 from styleexp.inputs.style import Style
 from styleexp.method.patches import relief_of_result
-from styleexp.method.subject import pattern_unit
+from styleexp.method.pattern_size import pattern_unit
 from styleexp.runs import finding, origins, reading, records, results
 from styleexp.system.errors import UserError
 

@@ -45,7 +45,8 @@ from styleexp.method.height_maps import HeightMap, triplanar
 from styleexp.method.losses import gram_matrix, layer_mask
 from styleexp.method.options import FieldConfig, StyleConfig
 from styleexp.method.patches import WINDOW, Relief, relief_of_mesh, relief_of_result, windows
-from styleexp.method.subject import choose_field, pattern_unit
+from styleexp.method.pattern_size import pattern_unit
+from styleexp.method.subject import choose_field
 from styleexp.method.views import orbit
 from styleexp.plugins import load_encoder
 from styleexp.renderers.base import Shading

@@ -27,7 +27,6 @@ from styleexp.inputs.meshes.mesh import edges_of as edges_of
 from styleexp.inputs.meshes.mesh import face_areas as face_areas
 from styleexp.inputs.meshes.mesh import mean_edge_length as mean_edge_length
 from styleexp.inputs.meshes.mesh import normalisation as normalisation
-from styleexp.inputs.meshes.mesh import solidity as solidity
 from styleexp.inputs.meshes.mesh import vertex_normals as vertex_normals
 
 if TYPE_CHECKING:

@@ -12,9 +12,6 @@ from styleexp.system.errors import UserError
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int, UInt8
 
-OPEN = 0.02
-"""Fraction of edges at a boundary above which a surface is open."""
-
 
 @dataclass(frozen=True)
 class Carrier:
@@ -173,23 +170,6 @@ def mean_edge_length(
     """Mean length of the edges, each counted once."""
     a, b = edges_of(faces).T
     return float(np.linalg.norm(vertices[a] - vertices[b], axis=1).mean())
-
-
-def solidity(vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]) -> float:
-    """Volume relative to that of the convex hull, at most 1: 1 for a ball, about 0.5 for a cow, 0.2
-    for a person with spread arms. Small holes are closed; a surface that is open or flat has 1."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    edges = len(edges_of(faces))
-    if 2 * edges - 3 * len(faces) > OPEN * edges:  # the number of edges at the boundary
-        return 1.0
-    a, b, c = ((vertices - vertices.mean(axis=0))[faces[:, k]] for k in range(3))
-    volume = abs(float((a * np.cross(b, c)).sum())) / 6
-    try:
-        hull = ConvexHull(vertices).volume
-    except QhullError:
-        return 1.0
-    return min(volume / hull, 1.0)
 
 
 def _crosses(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from torch.nn import functional
 
 from styleexp.inputs import measured
 from styleexp.method.patches import blurred
-from styleexp.method.relief import heat_smoother, mesh_frequency
+from styleexp.method.relief import heat_smoother, mesh_frequency, picture_frequency
 from styleexp.method.synthesis.direction import UP, direction_field, turned
 from styleexp.method.synthesis.walk import Sheet
 
@@ -182,6 +182,11 @@ class PictureExemplar:
         """Length of the longer side."""
         return self.pixel * max(self.height.shape)
 
+    @property
+    def frequency(self) -> float:
+        """RMS frequency of the heights, in cycles per unit."""
+        return picture_frequency(self.height.numpy()) / self.extent
+
     def sample(
         self, count: int, side: int, spacing: float, rng: np.random.Generator, any_way: bool
     ) -> tuple[Float[Tensor, "patches side side"], Places]:
@@ -262,14 +267,14 @@ class Pattern:
     """``low`` and ``high`` are the 1st and 99th percentiles of the heights."""
 
 
-def pattern_of(exemplar: Exemplar, seed: int) -> Pattern:
-    """`measure` with the random numbers of a seed; kept for the next run with the same style."""
+def pattern_of(exemplar: Exemplar) -> Pattern:
+    """`measure`, kept for the next run with the same style."""
 
     def make() -> measured.Arrays:
-        found = measure(exemplar, np.random.default_rng(seed))
+        found = measure(exemplar, np.random.default_rng(0))
         return {name: np.array([each]) for name, each in asdict(found).items()}
 
-    found = measured.kept("pattern", exemplar.arrays(), str(seed), make)
+    found = measured.kept("pattern", exemplar.arrays(), "", make)
     return Pattern(**{name: each.item() for name, each in found.items()})
 
 

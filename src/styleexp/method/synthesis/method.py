@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -48,6 +48,13 @@ mesh."""
 MOST_LEVELS = 5
 EVEN = 1.5
 """Smoothing length in edges; removes finer relief, which would turn steep walls into sawteeth."""
+OWN = 1.5
+"""Features of the source smaller than this, in wavelengths, give way to the style's relief."""
+THIN = 0.3
+"""Radius inside the source, relative to the size of such features, at which none give way; at twice
+that, all."""
+POINTS = 5_000
+"""Maximum number of vertices at which that radius is measured."""
 ROOM = 0.6
 """Maximum fraction of the free space inside and outside the surface that the relief may use."""
 
@@ -66,8 +73,9 @@ class Synthesis(Method[Scene]):
             still = np.zeros(len(subject.source.vertices))
             return Result(subject, still, subject.source.vertices.copy())
         begun = begin(subject)
-        height = deque(heights(subject, begun, self.config), maxlen=1).pop()
-        return self.laid(subject, begun, height)
+        ahead = directions(subject, begun)
+        height = deque(heights(subject, begun, ahead, self.config), maxlen=1).pop()
+        return replace(self.laid(subject, begun, height), directions=ahead)
 
     def laid(self, subject: Subject, begun: Begun, height: Float[Tensor, " vertices"]) -> Result:
         """Displace the source by these heights; see `heights`."""
@@ -98,7 +106,8 @@ def relief(
     """The style's relief at the source's vertices, scaled by ``strength``, in radii of the
     normalised source, with zero mean over the surface."""
     begun = begin(subject)
-    height = deque(heights(subject, begun, config), maxlen=1).pop()
+    rounds = heights(subject, begun, directions(subject, begun), config)
+    height = deque(rounds, maxlen=1).pop()
     return displacement(subject, begun, height, strength)
 
 
@@ -106,7 +115,7 @@ def begin(subject: Subject) -> Begun:
     """Measure the style's pattern, and prepare the source for walking."""
     doing("measuring the style's pattern")
     exemplar = exemplar_of_style(subject)
-    pattern = pattern_of(exemplar, subject.settings.optim.seed)
+    pattern = pattern_of(exemplar)
     surface = subject.surface
     sheet = Sheet(
         surface.vertices.cpu().numpy(), subject.source.faces, surface.normals.cpu().numpy()
@@ -115,11 +124,14 @@ def begin(subject: Subject) -> Begun:
 
 
 def heights(
-    subject: Subject, begun: Begun, config: SynthesisConfig
+    subject: Subject,
+    begun: Begun,
+    ahead: Float[np.ndarray, "vertices 3"],
+    config: SynthesisConfig,
 ) -> Iterator[Float[Tensor, " vertices"]]:
-    """Synthesise the pattern on the source: the vertices' heights, in units of the pattern, after
-    the quilt and every round. The last are the result."""
-    ahead = directions(subject, begun.sheet, begun.directed)
+    """Synthesise the pattern on the source, its up along ``ahead`` (see `directions`): the
+    vertices' heights, in units of the pattern, after the quilt and every round. The last are the
+    result."""
     levels = levels_of(begun.pattern, begun.sheet.edge / subject.unit)
     tell(summary(subject, begun.pattern, begun.directed, levels))
     total = ROUNDS * len(levels)
@@ -144,21 +156,24 @@ def displacement(
     sheet = begun.sheet
     even = heat_smoother(sheet.vertices, sheet.faces, EVEN * sheet.edge)
     moved = torch.from_numpy(even(height.numpy())) * subject.unit * strength
-    moved *= torch.from_numpy(fade(sheet, half_range(moved.numpy())))
+    high = half_range(moved.numpy())
+    moved *= torch.from_numpy(fade(sheet, high))
+    length = OWN * begun.pattern.wavelength * subject.unit
+    moved -= torch.from_numpy(own_relief(sheet, length, high))
     moved = zero_mean(moved, subject.weights.cpu().double(), math.inf)
     return moved.to(subject.surface.vertices.device)
 
 
-def directions(subject: Subject, sheet: Sheet, directed: bool) -> Float[np.ndarray, "vertices 3"]:
+def directions(subject: Subject, begun: Begun) -> Float[np.ndarray, "vertices 3"]:
     """Direction of the pattern's up at each vertex; see `options.StyleConfig`."""
-    style = subject.settings.style
+    style, sheet = subject.settings.style, begun.sheet
     name = style.direction
     if name.startswith(ATTRIBUTE):
         wish = attributes.vectors(subject.source, name.removeprefix(ATTRIBUTE), "style.direction")
     else:
         axis = "xyz".index(name) if name in "xyz" else 1
         wish = np.broadcast_to(np.eye(3)[axis], sheet.vertices.shape)
-    follows = name == "flow" or (name == "auto" and not directed)
+    follows = name == "flow" or (name == "auto" and not begun.directed)
     ahead = direction_field(sheet, wish, FLOW if follows else UP)
     return turned(ahead, sheet.normals, math.radians(style.rotation))
 
@@ -194,6 +209,21 @@ def summary(subject: Subject, pattern: Pattern, directed: bool, levels: list[flo
         f"{(pattern.high - pattern.low) * subject.unit:.3f} radii of the source, "
         f"{'with' if directed else 'without'} a direction; {len(levels)} levels"
     )
+
+
+def own_relief(sheet: Sheet, length: float, height: float) -> Float[np.ndarray, " vertices"]:
+    """The source's own relief: features smaller than ``length``, and no higher than about
+    ``height``. The style's takes its place; on top of plates and folds of the same size no pattern
+    can be made out. 0 where the source is thin, as at fingertips, which would wither."""
+    smooth = heat_smoother(sheet.vertices, sheet.faces, length)
+    above = ((sheet.vertices - smooth(sheet.vertices)) * sheet.normals).sum(axis=1)
+    above -= heat_smoother(sheet.vertices, sheet.faces, 3 * length)(above)  # of the form's bends
+    # Few points are enough, and the medial axis is where looking for the nearest is slowest.
+    some = np.arange(0, len(above), math.ceil(len(above) / POINTS))
+    few = Sheet(sheet.vertices[some], sheet.faces[:0], sheet.normals[some])
+    wide = (ball_radius(few, -1, length) / length / THIN - 1).clip(0, 1)
+    wide = wide[few.nearest(sheet.vertices)]
+    return height * np.tanh(above / max(height, 1e-12)) * smooth(wide).clip(0, 1)
 
 
 def fade(sheet: Sheet, height: float) -> Float[np.ndarray, " vertices"]:
